@@ -1,0 +1,1 @@
+"""Pure stages of the monitor: numpy arrays in, immutable values out."""

@@ -1,0 +1,227 @@
+"""Training data in the fleet layout: a folder of sets, each with ``images/``, ``labels/`` and ``set.json``.
+
+``set.json`` names the classes that were drawn (``labelled_classes``), what the pixels of a value may be
+(``folded_into``) and the ``splits``; labels are 8 bit PNG, one value per pixel, ``labels.IGNORE`` for no statement.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from models import augment
+from models.losses import group_table
+from pipeline import labels
+
+THIN = (labels.LANE, labels.POLE)
+"""Classes that crops are centred on."""
+
+CACHE_BYTES = 2 << 30
+"""Decoded pictures kept in memory; more are decoded again at each use."""
+
+
+class DataError(Exception):
+    """A training folder that does not keep the layout; the text names the file."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledSet:
+    """One set of one camera or source.
+
+    Args:
+        folder: Where it lies.
+        groups: What a label value may be, bool (classes, classes), see ``losses.group_table``.
+        labelled: The classes that were drawn.
+        splits: Split name -> picture ids.
+    """
+
+    folder: Path
+    groups: NDArray[np.bool_]
+    labelled: frozenset[int]
+    splits: dict[str, tuple[str, ...]]
+
+    def files(self, identifier: str) -> tuple[Path, Path]:
+        """Return picture and label of one id.
+
+        Raises:
+            DataError: If one of them is missing.
+        """
+        label = self.folder / "labels" / f"{identifier}.png"
+        for suffix in (".jpg", ".png"):
+            picture = self.folder / "images" / f"{identifier}{suffix}"
+            if picture.is_file() and label.is_file():
+                return picture, label
+        raise DataError(f"{self.folder}: {identifier} of a split has no images/{identifier}.jpg (or .png) or no {label.name}")
+
+    def read(self, identifier: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Decode one pair: BGR uint8 (H, W, 3) and label values uint8 (H, W).
+
+        Raises:
+            DataError: If a file can not be decoded, sizes differ or a value is not one of the set's.
+        """
+        picture_file, label_file = self.files(identifier)
+        picture = cv2.imread(str(picture_file), cv2.IMREAD_COLOR)
+        label = cv2.imread(str(label_file), cv2.IMREAD_UNCHANGED)
+        if picture is None or label is None or label.ndim != 2 or label.dtype != np.uint8:
+            raise DataError(f"{label_file}: picture or 8 bit label of one channel can not be decoded")
+        if picture.shape[:2] != label.shape:
+            raise DataError(f"{label_file}: {label.shape} does not fit the picture's {picture.shape[:2]}")
+        table = np.eye(len(labels.NAMES), dtype=np.bool_)
+        known = {*self.labelled, *np.flatnonzero((self.groups != table).any(axis=1)).tolist(), labels.IGNORE}
+        strange = set(np.unique(label).tolist()) - known
+        if strange:
+            raise DataError(f"{label_file}: values {sorted(strange)} are neither labelled nor folded in set.json")
+        return picture.astype(np.uint8, copy=False), label.astype(np.uint8, copy=False)
+
+
+def read_set(folder: Path) -> LabelledSet:
+    """Read ``set.json`` of one set.
+
+    Raises:
+        DataError: If it is missing or says something that does not fit the label contract.
+    """
+    try:
+        said: dict[str, Any] = json.loads((folder / "set.json").read_text(encoding="utf-8"))
+        folded = {int(value): [int(c) for c in group] for value, group in said.get("folded_into", {}).items()}
+        return LabelledSet(
+            folder=folder,
+            groups=group_table(folded),
+            labelled=frozenset(int(c) for c in said["labelled_classes"]),
+            splits={str(name): tuple(map(str, ids)) for name, ids in said["splits"].items()},
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{folder / 'set.json'}: {error}") from error
+
+
+def read_sets(roots: list[Path]) -> list[LabelledSet]:
+    """Read every set below the given folders, in the order of their names.
+
+    Raises:
+        DataError: If there is none, or a ``classes.json`` names other classes than the label contract.
+    """
+    found: list[LabelledSet] = []
+    for root in roots:
+        contract = root / "classes.json"
+        if contract.is_file() and tuple(json.loads(contract.read_text(encoding="utf-8"))["classes"]) != labels.NAMES:
+            raise DataError(f"{contract}: classes are not {', '.join(labels.NAMES)}")
+        found += [read_set(path.parent) for path in sorted(root.glob("*/set.json"))]
+    if not found:
+        raise DataError(f"no */set.json below {', '.join(map(str, roots))}")
+    return found
+
+
+def fingerprint(sets: list[LabelledSet], split: str = "train") -> str:
+    """Return the SHA-256 of the pictures and labels of a split: which data made a model."""
+    digest = hashlib.sha256()
+    for one in sorted(sets, key=lambda s: s.folder.name):
+        for identifier in sorted(one.splits.get(split, ())):
+            for path in one.files(identifier):
+                digest.update(f"{one.folder.name}/{path.name}\0".encode())
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crop:
+    """One training sample: BGR uint8 (h, w, 3), label values uint8 (h, w), groups bool (classes, classes)."""
+
+    picture: NDArray[np.uint8]
+    label: NDArray[np.uint8]
+    groups: NDArray[np.bool_]
+
+
+class Sampler:
+    """Draws crops of the training splits: a set by its weight, a picture evenly, a place near paint or a pole.
+
+    Args:
+        sets: Sets with a ``train`` split; others are left out.
+        size: Crop (height, width), px.
+        weights: Set name -> share of the draws, relative; a set not named counts by the root of its size, so that a
+            large set of one camera does not drown small ones.
+        thin_share: Share of the crops that are centred on a thin class where the set has one.
+        widths: A picture is scaled so that its full width falls in this range, px, log-uniform: what the run time
+            sees. Poles must keep their 2 to 5 px.
+        largest_scale: Upper bound of the magnification: beyond it there is nothing but blur to learn.
+    """
+
+    def __init__(
+        self,
+        sets: list[LabelledSet],
+        size: tuple[int, int],
+        weights: dict[str, float],
+        *,
+        thin_share: float = 0.75,
+        widths: tuple[float, float] = (760.0, 1600.0),
+        largest_scale: float = 2.0,
+    ) -> None:
+        self._sets = [one for one in sets if one.splits.get("train")]
+        unknown = set(weights) - {one.folder.name for one in self._sets}
+        if unknown or not self._sets:
+            raise DataError(f"no set with a train split is called {', '.join(sorted(unknown)) or 'anything'}")
+        shares = np.array([weights.get(s.folder.name, len(s.splits["train"]) ** 0.5) for s in self._sets])
+        self._shares = shares / shares.sum()
+        self._size = size
+        self._thin_share = thin_share
+        self._widths = widths
+        self._largest_scale = largest_scale
+        self._cache: dict[Path, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
+        self._cached = 0
+
+    def draw(self, rng: np.random.Generator) -> Crop:
+        """Draw one augmented crop."""
+        one = self._sets[int(rng.choice(len(self._sets), p=self._shares))]
+        identifiers = one.splits["train"]
+        picture, label = self._load(one, identifiers[int(rng.integers(len(identifiers)))])
+        target = np.exp(rng.uniform(*np.log(self._widths)))
+        scale = min(target / label.shape[1], self._largest_scale)
+        stretch = np.exp(rng.uniform(-0.1, 0.1))
+        scales = (float(scale * stretch), float(scale / stretch))
+        centre = self._place(one, label, scales, rng)
+        crop, moved = augment.cut(picture, label, centre, scales, self._size, flip=bool(rng.random() < 0.5))
+        return Crop(augment.photometric(crop, rng), moved, one.groups)
+
+    def batch(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_]]:
+        """Draw several crops: RGB uint8 (B, 3, h, w), labels uint8 (B, h, w), groups bool (B, classes, classes)."""
+        crops = [self.draw(rng) for _ in range(count)]
+        rgb = np.stack([crop.picture[..., ::-1].transpose(2, 0, 1) for crop in crops])
+        return rgb, np.stack([crop.label for crop in crops]), np.stack([crop.groups for crop in crops])
+
+    def _place(
+        self, one: LabelledSet, label: NDArray[np.uint8], scales: tuple[float, float], rng: np.random.Generator
+    ) -> tuple[float, float]:
+        """Choose the centre of the crop, px: near a thin class, else anywhere."""
+        reach = np.array([self._size[1] / scales[0], self._size[0] / scales[1]])
+        thin = [c for c in THIN if c in one.labelled]
+        if thin and rng.random() < self._thin_share:
+            seen = label == thin[int(rng.integers(len(thin)))]
+            # One row, or column, then a pixel in it: by pixels alone, near and fat strokes would take all crops.
+            axis = int(rng.integers(2))
+            lines = np.flatnonzero(seen.any(axis=1 - axis))
+            if lines.size:
+                line = int(rng.choice(lines))
+                other = int(rng.choice(np.flatnonzero(seen.take(line, axis=axis))))
+                u, v = (other, line) if axis == 0 else (line, other)
+                jitter = rng.uniform(-0.4, 0.4, 2) * reach
+                return float(u + jitter[0]), float(v + jitter[1])
+        height, width = label.shape
+        inside = [
+            rng.uniform(min(r / 2, n / 2), max(n - r / 2, n / 2)) for r, n in zip(reach, (width, height), strict=True)
+        ]
+        return float(inside[0]), float(inside[1])
+
+    def _load(self, one: LabelledSet, identifier: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        key = one.folder / identifier
+        if key not in self._cache:
+            pair = one.read(identifier)
+            if self._cached + pair[0].nbytes + pair[1].nbytes > CACHE_BYTES:
+                return pair
+            self._cache[key] = pair
+            self._cached += pair[0].nbytes + pair[1].nbytes
+        return self._cache[key]

@@ -1,0 +1,99 @@
+"""Loss for labels that say a group of classes: the negative log of the group's summed probability."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from pipeline import labels
+
+CLASS_WEIGHTS = (1.0, 3.0, 4.0, 1.0, 1.0, 1.0, 1.0, 1.0, 2.0)
+"""Weight of a pixel by its label value. Paint and poles cover 1 to 2 % of a road picture: without weight the cheapest
+answer is to deny them. More weight over-paints: the probabilities then say more than was seen."""
+
+_CLASSES = len(labels.NAMES)
+_IMPOSSIBLE = -1e4
+"""Added to the logits outside the group: the exponential of it is zero in float32, the gradient too, and no NaN."""
+
+
+def group_table(folded_into: dict[int, list[int]] | None = None) -> NDArray[np.bool_]:
+    """Return what each label value may be: bool (classes, classes), row = value, column = class.
+
+    Args:
+        folded_into: Label value -> all classes that its pixels may be; values not named mean themselves.
+
+    Raises:
+        ValueError: If a value or class is not in the label contract, or a group leaves out its own value.
+    """
+    table = np.eye(_CLASSES, dtype=np.bool_)
+    for value, group in (folded_into or {}).items():
+        if not 0 <= value < _CLASSES or not all(0 <= c < _CLASSES for c in group) or value not in group:
+            raise ValueError(f"group {value} -> {group} does not fit the {_CLASSES} classes")
+        table[value] = False
+        table[value, group] = True
+    return table
+
+
+def grouped_nll(
+    logits: torch.Tensor, target: torch.Tensor, groups: torch.Tensor, weights: torch.Tensor
+) -> torch.Tensor:
+    """Return the weighted mean over labelled pixels of ``-log(sum of p over the pixel's group)``.
+
+    The target may stand on a finer grid than the logits: each cell then answers for all its pixels, so that the
+    probability it learns is the share of the cell that the class covers.
+
+    Args:
+        logits: (B, classes, h, w).
+        target: Label values, integer (B, f*h, f*w) with a whole number f; ``labels.IGNORE`` takes no part.
+        groups: What a value may be, bool (B, classes, classes), see ``group_table``.
+        weights: Weight of a pixel by its label value, (classes,).
+    """
+    batch, _, height, width = logits.shape
+    factor = target.shape[1] // height
+    if target.shape != (batch, factor * height, factor * width):
+        raise ValueError(f"target {tuple(target.shape)} is no whole multiple of logits {tuple(logits.shape)}")
+    everything = torch.logsumexp(logits, dim=1)
+    penalty = torch.where(groups, 0.0, _IMPOSSIBLE).to(logits.dtype)
+    sample = torch.arange(batch, device=logits.device).view(batch, 1, 1)
+    last = logits.permute(0, 2, 3, 1)
+    total = logits.new_zeros(())
+    weight_sum = logits.new_zeros(())
+    for row in range(factor):
+        for column in range(factor):
+            values = target[:, row::factor, column::factor].long()
+            known = values != labels.IGNORE
+            values = torch.where(known, values, 0)
+            group = torch.logsumexp(last + penalty[sample, values], dim=-1)
+            weight = weights[values] * known
+            total = total + (weight * (everything - group)).sum()
+            weight_sum = weight_sum + weight.sum()
+    return total / weight_sum.clamp(min=1.0)
+
+
+def boosted_loss(
+    logits: torch.Tensor,
+    boosted: list[torch.Tensor],
+    target: torch.Tensor,
+    groups: torch.Tensor,
+    weights: torch.Tensor,
+    *,
+    booster_share: float = 0.25,
+) -> torch.Tensor:
+    """Return the loss of the head plus a share of each booster's, whose cells answer for their centre pixel.
+
+    Args:
+        logits: Head, (B, classes, h, w).
+        boosted: Heads of the semantic stages, each (B, classes, h', w'), coarser than the target by a whole factor.
+        target: As in ``grouped_nll``.
+        groups: As in ``grouped_nll``.
+        weights: As in ``grouped_nll``.
+        booster_share: Weight of one booster: they guide the stages, the head is what is used.
+    """
+    loss = grouped_nll(logits, target, groups, weights)
+    for coarse in boosted:
+        step = target.shape[1] // coarse.shape[2]
+        centres = target[:, step // 2 :: step, step // 2 :: step]
+        loss = loss + booster_share * grouped_nll(coarse, centres, groups, weights)
+    return loss

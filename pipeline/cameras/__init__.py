@@ -1,0 +1,137 @@
+"""Camera models, one file each: every module here offers ``MODEL`` (a :class:`LensModel`) under its message name.
+
+All work on normalised coordinates ``x = X/Z, y = Y/Z``; :func:`project` and :func:`undistort` add K, the image's
+borders and the fold: beyond the radius where a polynomial lens stops growing nothing projects (FORMULAS E3).
+"""
+
+import importlib
+import pkgutil
+from functools import cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.records import CameraModel, Floats
+
+NEAREST_DEPTH_M = 0.1
+"""m; a point nearer to the image plane does not project (FORMULAS B (1))."""
+
+
+class LensModel(Protocol):
+    """What a camera model offers."""
+
+    names: tuple[str, ...]
+    """Names under which messages and rig files know it."""
+
+    def distort(self, xy: Floats, D: Floats) -> Floats:
+        """Normalised coordinates (N,2) -> distorted normalised coordinates (N,2)."""
+
+    def jacobian(self, xy: Floats, D: Floats) -> Floats:
+        """d distorted / d xy, (N,2,2)."""
+
+    def limit(self, D: Floats) -> float:
+        """Largest ``hypot(x, y)`` for which the model is one to one; inf where there is none."""
+
+
+@cache
+def lens_models() -> dict[str, LensModel]:
+    """Every model in this folder by each of its names."""
+    found: dict[str, LensModel] = {}
+    for module in pkgutil.iter_modules(__path__):
+        model: LensModel = importlib.import_module(f"{__name__}.{module.name}").MODEL
+        found.update(dict.fromkeys(model.names, model))
+    return found
+
+
+def lens_of(camera: CameraModel) -> LensModel:
+    """The lens model of a camera; InputError names those that exist."""
+    models = lens_models()
+    if camera.model not in models:
+        raise InputError(
+            f"camera model '{camera.model}' is not known", hint=f"known: {', '.join(sorted(models))}"
+        )
+    return models[camera.model]
+
+
+def project(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Pixels of points in the camera frame.
+
+    Args:
+        camera: Intrinsics.
+        points_cam: float64 (N,3), metres, camera optical frame.
+
+    Returns:
+        Pixels float64 (N,2), and bool (N,): in front of the camera, inside the lens model and inside the image.
+        Pixels of points behind the camera or beyond the fold are NaN.
+    """
+    uv, valid = project_unbounded(camera, points_cam)
+    inside = (
+        (uv[:, 0] >= -0.5)
+        & (uv[:, 0] < camera.width - 0.5)
+        & (uv[:, 1] >= -0.5)
+        & (uv[:, 1] < camera.height - 0.5)
+    )
+    return uv, valid & inside
+
+
+def project_unbounded(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """As :func:`project` without the borders of the image: bool (N,) tells what projects at all."""
+    z = points_cam[:, 2]
+    valid = z > NEAREST_DEPTH_M
+    lens = lens_of(camera)
+    xy = points_cam[:, :2] / np.where(valid, z, 1.0)[:, None]
+    valid &= np.hypot(xy[:, 0], xy[:, 1]) < lens.limit(camera.D)
+    xy = np.where(valid[:, None], xy, 0.0)
+    d = lens.distort(xy, camera.D)
+    uv = d @ camera.K[:2, :2].T + camera.K[:2, 2]
+    return np.where(valid[:, None], uv, np.nan), valid
+
+
+def projection_jacobian(camera: CameraModel, points_cam: Floats) -> Floats:
+    """d pixel / d point in the camera frame, (N,2,3). The points must project."""
+    z = points_cam[:, 2]
+    xy = points_cam[:, :2] / z[:, None]
+    J_lens = lens_of(camera).jacobian(xy, camera.D)
+    J_xy = np.zeros((len(z), 2, 3))
+    J_xy[:, 0, 0] = J_xy[:, 1, 1] = 1.0 / z
+    J_xy[:, :, 2] = -xy / z[:, None]
+    return np.asarray(camera.K[:2, :2] @ J_lens @ J_xy, dtype=np.float64)
+
+
+_NEWTON_STEPS = 12
+"""FORMULAS E3: eight steps reach 5e-13 px; four more for strong wide lenses."""
+
+
+def undistort(camera: CameraModel, uv: Floats) -> Floats:
+    """Normalised coordinates (x, y at z = 1) of pixels (N,2), by Newton's method (FORMULAS E3).
+
+    Pixels that no ray inside the lens model reaches give NaN.
+    """
+    lens = lens_of(camera)
+    target = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
+    xy = target.copy()
+    limit = lens.limit(camera.D)
+    for _ in range(_NEWTON_STEPS):
+        residual = lens.distort(xy, camera.D) - target
+        step = np.linalg.solve(lens.jacobian(xy, camera.D) + 1e-12 * np.eye(2), residual[..., None])[..., 0]
+        xy = xy - step
+        # A step must not leave the region in which the lens is one to one, or it converges to a folded ray.
+        radius = np.hypot(xy[:, 0], xy[:, 1])
+        outside = radius > 0.999 * limit if np.isfinite(limit) else np.zeros(len(xy), dtype=bool)
+        if outside.any():
+            xy[outside] *= (0.999 * limit / radius[outside])[:, None]
+    reached = np.hypot(*(lens.distort(xy, camera.D) - target).T) < 1e-6
+    return np.where(reached[:, None], xy, np.nan)
+
+
+def ideal_pixels(camera: CameraModel, uv: Floats) -> Floats:
+    """Pixels (N,2) of the raw image as a pinhole camera with the same K would see them; NaN beyond the lens."""
+    return np.asarray(undistort(camera, uv) @ camera.K[:2, :2].T + camera.K[:2, 2], dtype=np.float64)
+
+
+def raw_pixels(camera: CameraModel, uv_ideal: Floats) -> Floats:
+    """Inverse of :func:`ideal_pixels`: pixels (N,2) of the raw image; NaN beyond the lens."""
+    xy = (uv_ideal - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
+    return project_unbounded(camera, np.column_stack([xy, np.ones(len(xy))]))[0]

@@ -89,6 +89,10 @@ Event: TypeAlias = StatusEvent | FrameEvent | EndEvent
 class Output(Protocol):
     """Something that tells the world. Nothing here may block the engine for longer than a disk write."""
 
+    @property
+    def lost(self) -> str | None:
+        """One clause that says what was lost for good and why; None while all is well."""
+
     def handle(self, event: Event) -> None:
         """Takes one event; OSError or CalibwatchError: this output is lost, the run goes on."""
 

@@ -35,7 +35,7 @@ def cut(
         flip: Mirror left and right.
 
     Returns:
-        Picture and label of the crop; outside the source the picture repeats its edge and the label is ignored.
+        Picture and label of the crop; outside the source the picture repeats its edge, the label is ignored.
     """
     height, width = size
     picture, label, centre = _window(picture, label, centre, (height / scale[1], width / scale[0]))
@@ -46,7 +46,9 @@ def cut(
         picture = cv2.GaussianBlur(picture, (0, 0), 0.5 * np.sqrt(1.0 / min(scale) ** 2 - 1.0) + 1e-3).astype(
             np.uint8, copy=False
         )
-    crop = cv2.warpAffine(picture, A, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    crop = cv2.warpAffine(
+        picture, A, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     moved = cv2.warpAffine(
         label,
         A,
@@ -78,7 +80,8 @@ def colour(picture: Picture, rng: np.random.Generator) -> Picture:
     x = (x - 110.0) * np.float32(rng.uniform(0.6, 1.4)) + np.float32(110.0 + rng.uniform(-35.0, 35.0))
     gamma = np.exp(rng.uniform(-0.5, 0.5))
     table = (255.0 * (np.arange(256) / 255.0) ** gamma).astype(np.uint8)
-    return table[np.clip(x, 0.0, 255.0).astype(np.uint8)]
+    adapted: Picture = table[np.clip(x, 0.0, 255.0).astype(np.uint8)]
+    return adapted
 
 
 def shadow(picture: Picture, rng: np.random.Generator) -> Picture:
@@ -88,8 +91,8 @@ def shadow(picture: Picture, rng: np.random.Generator) -> Picture:
     for _ in range(int(rng.integers(1, 3))):
         corners = rng.uniform((-0.2, -0.2), (1.2, 1.2), (int(rng.integers(3, 6)), 2)) * (width, height)
         cv2.fillConvexPoly(dark, cv2.convexHull(corners.astype(np.int32)), float(rng.uniform(0.35, 0.8)))
-    dark = cv2.GaussianBlur(dark, (0, 0), float(rng.uniform(0.5, 8.0)))
-    return (picture * dark[..., None]).astype(np.uint8)
+    soft = cv2.GaussianBlur(dark, (0, 0), float(rng.uniform(0.5, 8.0)))
+    return (picture * soft[..., None]).astype(np.uint8)
 
 
 def night(picture: Picture, rng: np.random.Generator) -> Picture:
@@ -105,7 +108,7 @@ def night(picture: Picture, rng: np.random.Generator) -> Picture:
 
 def blur(picture: Picture, rng: np.random.Generator) -> Picture:
     """Defocus, or the smear of motion along a random direction."""
-    if rng.random() < 0.5:
+    if rng.integers(2) == 0:
         return cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.4, 1.5))).astype(np.uint8, copy=False)
     length = int(rng.integers(3, 8))
     kernel = np.zeros((length, length), np.float32)

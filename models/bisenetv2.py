@@ -1,9 +1,9 @@
-"""BiSeNetV2 (Yu et al. 2021, arXiv 2004.02147) with a head at half scale, so that thin paint and poles survive.
+"""BiSeNetV2 (Yu et al. 2021, arXiv 2004.02147) with a head at half scale, so that thin things survive.
 
-As published: a wide and shallow detail branch to 1/8, a narrow and deep semantic branch (stem, gather-and-expansion
-layers, context embedding) to 1/32, bilateral guided aggregation of the two, booster heads on the semantic stages
-while training. Ours: the aggregate climbs back to 1/4 and 1/2 over the detail branch's own stages, because at 1/8 a
-lane line that is 4 px wide, or a post that is 3 px wide, is less than one cell.
+As published: a wide and shallow detail branch to 1/8, a narrow and deep semantic branch (stem,
+gather-and-expansion layers, context embedding) to 1/32, bilateral guided aggregation of the two, booster
+heads on the semantic stages while training. Ours: the aggregate climbs back to 1/4 and 1/2 over the detail
+branch's own stages, because at 1/8 a lane line of 4 px, or a post of 3 px, is less than one cell.
 """
 
 from __future__ import annotations
@@ -73,9 +73,7 @@ class DetailBranch(nn.Module):
         self.to4 = nn.Sequential(
             conv(half, quarter, stride=2), conv(quarter, quarter), conv(quarter, quarter)
         )
-        self.to8 = nn.Sequential(
-            conv(quarter, eighth, stride=2), conv(eighth, eighth), conv(eighth, eighth)
-        )
+        self.to8 = nn.Sequential(conv(quarter, eighth, stride=2), conv(eighth, eighth), conv(eighth, eighth))
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Map (B, 3, H, W) to the stages at 1/2, 1/4 and 1/8."""
@@ -102,7 +100,7 @@ class Stem(nn.Module):
 
 
 class GatherExpansion(nn.Module):
-    """Gather by a 3x3 convolution, expand by depthwise ones, project back; with stride 2 the shortcut walks too."""
+    """Gather by a 3x3 convolution, expand by depthwise ones, project back and add the shortcut."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: int, expansion: int) -> None:
         super().__init__()
@@ -169,7 +167,7 @@ def _stage(inputs: int, outputs: int, *, layers: int, expansion: int) -> nn.Modu
 
 
 class Aggregation(nn.Module):
-    """Bilateral guided aggregation: each branch gates the other, at its own scale, and the sum is joined at 1/8."""
+    """Bilateral guided aggregation: each branch gates the other at its own scale; the sum comes out at 1/8."""
 
     def __init__(self, detail: int, semantic: int, fused: int) -> None:
         super().__init__()
@@ -192,7 +190,7 @@ class Aggregation(nn.Module):
 
 
 class BiSeNetV2(nn.Module):
-    """The network: RGB 0..255 (B, 3, H, W), H and W multiples of ``STRIDE``, to logits (B, classes, H/2, W/2)."""
+    """From RGB 0..255 (B, 3, H, W), H and W multiples of ``STRIDE``, to logits (B, classes, H/2, W/2)."""
 
     def __init__(self, widths: Widths | None = None, classes: int = len(labels.NAMES)) -> None:
         super().__init__()
@@ -215,7 +213,7 @@ class BiSeNetV2(nn.Module):
         self.register_buffer("std", torch.tensor(STD_RGB).view(1, 3, 1, 1))
 
     def forward(self, rgb: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Return the logits at 1/2 and, in training only, those of the boosters at 1/4, 1/8, 1/16 and 1/32."""
+        """Return the logits at 1/2 and, in training only, the boosters' at 1/4, 1/8, 1/16 and 1/32."""
         x = (rgb - self.mean) / self.std
         half, quarter, eighth = self.detail(x)
         *stages, context = self.semantic(x)

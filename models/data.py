@@ -1,7 +1,8 @@
 """Training data in the fleet layout: a folder of sets, each with ``images/``, ``labels/`` and ``set.json``.
 
 ``set.json`` names the classes that were drawn (``labelled_classes``), what the pixels of a value may be
-(``folded_into``) and the ``splits``; labels are 8 bit PNG, one value per pixel, ``labels.IGNORE`` for no statement.
+(``folded_into``) and the ``splits``; labels are 8 bit PNG, one value per pixel, ``labels.IGNORE`` where
+nothing is said.
 """
 
 from __future__ import annotations
@@ -9,16 +10,19 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from models import augment
 from models.losses import group_table
 from pipeline import labels
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
 
 THIN = (labels.LANE, labels.POLE)
 """Classes that crops are centred on."""
@@ -58,7 +62,9 @@ class LabelledSet:
             picture = self.folder / "images" / f"{identifier}{suffix}"
             if picture.is_file() and label.is_file():
                 return picture, label
-        raise DataError(f"{self.folder}: {identifier} of a split has no images/{identifier}.jpg (or .png) or no {label.name}")
+        raise DataError(
+            f"{self.folder}: {identifier} of a split lacks its images/*.jpg (or .png) or labels/*.png"
+        )
 
     def read(self, identifier: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Decode one pair: BGR uint8 (H, W, 3) and label values uint8 (H, W).
@@ -77,7 +83,9 @@ class LabelledSet:
         known = {*self.labelled, *np.flatnonzero((self.groups != table).any(axis=1)).tolist(), labels.IGNORE}
         strange = set(np.unique(label).tolist()) - known
         if strange:
-            raise DataError(f"{label_file}: values {sorted(strange)} are neither labelled nor folded in set.json")
+            raise DataError(
+                f"{label_file}: values {sorted(strange)} are neither labelled nor folded in set.json"
+            )
         return picture.astype(np.uint8, copy=False), label.astype(np.uint8, copy=False)
 
 
@@ -109,7 +117,10 @@ def read_sets(roots: list[Path]) -> list[LabelledSet]:
     found: list[LabelledSet] = []
     for root in roots:
         contract = root / "classes.json"
-        if contract.is_file() and tuple(json.loads(contract.read_text(encoding="utf-8"))["classes"]) != labels.NAMES:
+        if (
+            contract.is_file()
+            and tuple(json.loads(contract.read_text(encoding="utf-8"))["classes"]) != labels.NAMES
+        ):
             raise DataError(f"{contract}: classes are not {', '.join(labels.NAMES)}")
         found += [read_set(path.parent) for path in sorted(root.glob("*/set.json"))]
     if not found:
@@ -138,16 +149,16 @@ class Crop:
 
 
 class Sampler:
-    """Draws crops of the training splits: a set by its weight, a picture evenly, a place near paint or a pole.
+    """Draws crops of the training splits: a set by its weight, a picture, a place near paint or a pole.
 
     Args:
         sets: Sets with a ``train`` split; others are left out.
         size: Crop (height, width), px.
-        weights: Set name -> share of the draws, relative; a set not named counts by the root of its size, so that a
-            large set of one camera does not drown small ones.
+        weights: Set name -> share of the draws, relative; a set not named counts by the root of its size,
+            so that a large set of one camera does not drown small ones.
         thin_share: Share of the crops that are centred on a thin class where the set has one.
-        widths: A picture is scaled so that its full width falls in this range, px, log-uniform: what the run time
-            sees. Poles must keep their 2 to 5 px.
+        widths: A picture is scaled so that its full width falls in this range, px, log-uniform: what the
+            run time sees. Poles must keep their 2 to 5 px.
         largest_scale: Upper bound of the magnification: beyond it there is nothing but blur to learn.
     """
 
@@ -184,37 +195,41 @@ class Sampler:
         stretch = np.exp(rng.uniform(-0.1, 0.1))
         scales = (float(scale * stretch), float(scale / stretch))
         centre = self._place(one, label, scales, rng)
-        crop, moved = augment.cut(picture, label, centre, scales, self._size, flip=bool(rng.random() < 0.5))
+        crop, moved = augment.cut(picture, label, centre, scales, self._size, flip=bool(rng.integers(2)))
         return Crop(augment.photometric(crop, rng), moved, one.groups)
 
-    def batch(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_]]:
-        """Draw several crops: RGB uint8 (B, 3, h, w), labels uint8 (B, h, w), groups bool (B, classes, classes)."""
+    def batch(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_]]:
+        """Draw crops: RGB uint8 (B, 3, h, w), labels uint8 (B, h, w), groups bool (B, classes, classes)."""
         crops = [self.draw(rng) for _ in range(count)]
         rgb = np.stack([crop.picture[..., ::-1].transpose(2, 0, 1) for crop in crops])
         return rgb, np.stack([crop.label for crop in crops]), np.stack([crop.groups for crop in crops])
 
     def _place(
-        self, one: LabelledSet, label: NDArray[np.uint8], scales: tuple[float, float], rng: np.random.Generator
+        self,
+        one: LabelledSet,
+        label: NDArray[np.uint8],
+        scales: tuple[float, float],
+        rng: np.random.Generator,
     ) -> tuple[float, float]:
         """Choose the centre of the crop, px: near a thin class, else anywhere."""
         reach = np.array([self._size[1] / scales[0], self._size[0] / scales[1]])
         thin = [c for c in THIN if c in one.labelled]
         if thin and rng.random() < self._thin_share:
             seen = label == thin[int(rng.integers(len(thin)))]
-            # One row, or column, then a pixel in it: by pixels alone, near and fat strokes would take all crops.
+            # A row or column first, then a pixel in it: by pixels alone near, fat strokes would take all.
             axis = int(rng.integers(2))
             lines = np.flatnonzero(seen.any(axis=1 - axis))
             if lines.size:
                 line = int(rng.choice(lines))
                 other = int(rng.choice(np.flatnonzero(seen.take(line, axis=axis))))
-                u, v = (other, line) if axis == 0 else (line, other)
-                jitter = rng.uniform(-0.4, 0.4, 2) * reach
-                return float(u + jitter[0]), float(v + jitter[1])
-        height, width = label.shape
-        inside = [
-            rng.uniform(min(r / 2, n / 2), max(n - r / 2, n / 2)) for r, n in zip(reach, (width, height), strict=True)
-        ]
-        return float(inside[0]), float(inside[1])
+                centre = (
+                    np.array([other, line] if axis == 0 else [line, other])
+                    + rng.uniform(-0.4, 0.4, 2) * reach
+                )
+                return _within(centre, reach, label.shape)
+        return _within(rng.uniform(0.0, 1.0, 2) * label.shape[::-1], reach, label.shape)
 
     def _load(self, one: LabelledSet, identifier: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         key = one.folder / identifier
@@ -225,3 +240,13 @@ class Sampler:
             self._cache[key] = pair
             self._cached += pair[0].nbytes + pair[1].nbytes
         return self._cache[key]
+
+
+def _within(
+    centre: NDArray[np.float64], reach: NDArray[np.float64], shape: tuple[int, ...]
+) -> tuple[float, float]:
+    """Move a crop's centre (u, v) so that the crop lies in the picture, or round its middle if larger."""
+    size = np.array(shape[1::-1], np.float64)
+    half = np.minimum(reach, size) / 2
+    u, v = np.clip(centre, half, size - half)
+    return float(u), float(v)

@@ -1,7 +1,7 @@
 """The status of one pair, ``calibwatch.status/1`` (DESIGN 5): what goes on the bus, into files and to people.
 
 Every number is finite or null. Angles are degrees, lengths metres, stamps integer nanoseconds of the data's
-clock. ``status.schema.json`` beside this file is what :func:`json_schema` gives; a test holds the two together.
+clock. ``status.schema.json`` beside this file is what :func:`json_schema` gives; a test holds them together.
 """
 
 import math

@@ -87,18 +87,27 @@ class CrfParameters:
 
     def __post_init__(self) -> None:
         if self.iterations < 0:
-            raise RigError(f"CRF iterations {self.iterations} is negative", hint="0 keeps the network's labels")
+            raise RigError(
+                f"CRF iterations {self.iterations} is negative", hint="0 keeps the network's labels"
+            )
         for weight in self.class_weights:
             _require_compat(weight)
 
 
-def mean_field(unary: Floats32, image: NDArray[np.uint8], parameters: CrfParameters) -> Floats32:
+def mean_field(
+    unary: Floats32,
+    image: NDArray[np.uint8],
+    parameters: CrfParameters,
+    region: NDArray[np.bool_] | None = None,
+) -> Floats32:
     """Marginals of the CRF after ``parameters.iterations`` parallel updates.
 
     Args:
         unary: float32 (C,h,w), energies -log p in nats; a constant per pixel does not matter.
         image: uint8 (h,w,3), any channel order that ``sigma_colour`` shares.
         parameters: Kernels and number of updates.
+        region: bool (h,w), the pixels that take part and see each other; all others keep ``softmax(-unary)`` and
+            are seen by nobody. None: all take part.
 
     Returns:
         float32 (C,h,w), sums to one over the classes.
@@ -108,45 +117,65 @@ def mean_field(unary: Floats32, image: NDArray[np.uint8], parameters: CrfParamet
         RigError: As many class weights as classes are needed, or kernels too narrow for the size of the image.
     """
     _require_fitting(unary, image, parameters)
-    classes, height, width = unary.shape
-    minus_u = np.ascontiguousarray(-unary.reshape(classes, -1).T, dtype=np.float32)
-    q = _softmax(minus_u)
-    if parameters.iterations and q.size:
-        kernels = [
-            _normalised(plain, compat, height * width) for plain, compat in _kernels(image, parameters)
-        ]
-        weights = np.array(parameters.class_weights or (1.0,) * classes, dtype=np.float32)
-        for _ in range(parameters.iterations):
-            q = _softmax(minus_u + weights * _messages(q, kernels))
-    return np.ascontiguousarray(q.T).reshape(classes, height, width)
+    if region is None:
+        region = np.ones(image.shape[:2], dtype=np.bool_)
+    if region.shape != image.shape[:2] or region.dtype != np.bool_:
+        raise InputError(f"CRF: region {region.dtype}{region.shape} is no mask of image {image.shape}")
+    all_q = _softmax(np.ascontiguousarray(-unary.reshape(len(unary), -1).T, dtype=np.float32))
+    if parameters.iterations and region.any():
+        inside = np.flatnonzero(region)
+        minus_u = np.ascontiguousarray(-unary.reshape(len(unary), -1)[:, inside].T, dtype=np.float32)
+        all_q[inside] = _iterate(minus_u, all_q[inside], _kernels(image, region, parameters), parameters)
+    return np.ascontiguousarray(all_q.T).reshape(unary.shape)
+
+
+def _iterate(
+    minus_u: Floats32, q: Floats32, plain: list[tuple[Filter, float]], parameters: CrfParameters
+) -> Floats32:
+    """The updates on float32 (N,C)."""
+    classes = q.shape[1]
+    kernels = [_normalised(kernel, compat, len(q), classes - 1) for kernel, compat in plain]
+    weights = np.array(parameters.class_weights or (1.0,) * classes, dtype=np.float32)
+    for _ in range(parameters.iterations):
+        q = _softmax(minus_u + weights * _messages(q, kernels))
+    return q
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normalised:
-    """A kernel with its weights: float32 ``weight`` (N,1) is n, ``total`` (N,1) is c K~ 1."""
+    """A kernel with its weights, for ``c`` columns at once.
+
+    ``before`` is n, ``after`` is compat times n, both float32 (N,c); ``total`` (N,) is compat times K~ 1.
+    """
 
     plain: Filter
-    weight: Floats32
+    before: Floats32
+    after: Floats32
     total: Floats32
-    compat: float
 
     def __call__(self, values: Floats32) -> Floats32:
-        return np.float32(self.compat) * self.weight * self.plain(self.weight * values)
+        return self.after * self.plain(self.before * values)
 
 
-def _normalised(plain: Filter, compat: float, pixels: int) -> _Normalised:
-    weight = (1.0 / np.sqrt(plain(np.ones((pixels, 1), np.float32)) + 1e-20)).astype(np.float32)
-    return _Normalised(plain, weight, np.float32(compat) * weight * plain(weight), compat)
+def _normalised(plain: Filter, compat: float, pixels: int, columns: int) -> _Normalised:
+    n = (1.0 / np.sqrt(plain(np.ones((pixels, 1), np.float32)) + 1e-20)).astype(np.float32)
+    total = np.float32(compat) * n * plain(n)
+    before = np.repeat(n, columns, axis=1)
+    return _Normalised(plain, before, np.float32(compat) * before, total[:, 0])
 
 
 def _messages(q: Floats32, kernels: list[_Normalised]) -> Floats32:
     """What each class gains at each pixel, float32 (N,C)."""
+    last = q.shape[1] - 1
+    some = np.ascontiguousarray(q[:, :last])
     pull = np.zeros_like(q)
     for kernel in kernels:
         # The classes sum to one, so the last one follows from the others: a third of the work less for three.
-        some = kernel(q[:, :-1])
-        pull[:, :-1] += some
-        pull[:, -1] += kernel.total[:, 0] - some.sum(axis=1)
+        gained = kernel(some)
+        pull[:, :last] += gained
+        pull[:, last] += kernel.total
+        for column in range(last):
+            pull[:, last] -= gained[:, column]
     return pull
 
 
@@ -162,15 +191,15 @@ def _softmax(energy: Floats32) -> Floats32:
     return np.asarray(raised / total[:, None], dtype=np.float32)
 
 
-def _kernels(image: NDArray[np.uint8], parameters: CrfParameters) -> list[tuple[Filter, float]]:
-    height, width = image.shape[:2]
+def _kernels(
+    image: NDArray[np.uint8], region: NDArray[np.bool_], parameters: CrfParameters
+) -> list[tuple[Filter, float]]:
     found: list[tuple[Filter, float]] = []
     smooth, like = parameters.smoothness, parameters.appearance
     if smooth is not None and smooth.compat > 0:
-        found.append((_blur(height, width, smooth.sigma_x_px, smooth.sigma_y_px), smooth.compat))
+        found.append((_blur(region, smooth.sigma_x_px, smooth.sigma_y_px), smooth.compat))
     if like is not None and like.compat > 0:
-        lattice = _lattice(_appearance_features(image, like))
-        found.append((lattice, like.compat))
+        found.append((_lattice(_appearance_features(image, region, like)), like.compat))
     return found
 
 
@@ -178,14 +207,18 @@ _TAIL = 5.0
 """Standard deviations at which the blur stops; what lies beyond weighs 4e-6."""
 
 
-def _blur(height: int, width: int, sigma_x: float, sigma_y: float) -> Filter:
-    """Sum of exp(-d^2/2) over the pixels of the image; nothing lies outside it."""
+def _blur(region: NDArray[np.bool_], sigma_x: float, sigma_y: float) -> Filter:
+    """Sum of exp(-d^2/2) over the pixels of the region."""
+    height, width = region.shape
     along_x, along_y = _taps(sigma_x, width), _taps(sigma_y, height)
+    inside = np.flatnonzero(region)
 
     def blurred(values: Floats32) -> Floats32:
-        planes = values.reshape(height, width, -1)
-        out = cv2.sepFilter2D(planes, cv2.CV_32F, along_x, along_y, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(out, dtype=np.float32).reshape(values.shape)
+        planes = np.zeros((height * width, values.shape[1]), np.float32)
+        planes[inside] = values
+        shaped = planes.reshape(height, width, -1)
+        out = cv2.sepFilter2D(shaped, cv2.CV_32F, along_x, along_y, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(out, dtype=np.float32).reshape(planes.shape)[inside]
 
     return blurred
 
@@ -196,22 +229,25 @@ def _taps(sigma: float, size: int) -> Floats32:
     return np.exp(-0.5 * (offsets / sigma) ** 2).astype(np.float32)
 
 
-def _appearance_features(image: NDArray[np.uint8], kernel: AppearanceKernel) -> Floats32:
-    """float32 (5,N) in units of the standard deviations: colours, x, y."""
-    height, width = image.shape[:2]
-    features = np.empty((5, height, width), np.float32)
-    for channel in range(3):
-        np.divide(image[:, :, channel], np.float32(kernel.sigma_colour[channel]), out=features[channel])
-    features[3] = (np.arange(width) / kernel.sigma_x_px).astype(np.float32)
-    features[4] = (np.arange(height) / kernel.sigma_y_px).astype(np.float32)[:, None]
-    return features.reshape(5, -1)
+def _appearance_features(
+    image: NDArray[np.uint8], region: NDArray[np.bool_], kernel: AppearanceKernel
+) -> Floats32:
+    """float32 (5,N) of the region's pixels in units of the standard deviations: x, y, colours."""
+    rows, columns = np.nonzero(region)
+    widths = np.array([kernel.sigma_x_px, kernel.sigma_y_px, *kernel.sigma_colour], dtype=np.float32)
+    features = np.empty((5, len(rows)), np.float32)
+    features[0] = columns
+    features[1] = rows
+    features[2:] = image[rows, columns].T
+    features /= widths[:, None]
+    return features
 
 
 def _lattice(features: Floats32) -> Filter:
     """Gaussian sum over the permutohedral lattice of ``features`` (d,N), up to a common factor."""
     keys, shares, strides = _corners(features)
     corners, pixels = keys.shape
-    vertices, place = np.unique(keys.ravel(), return_inverse=True)
+    vertices, place = _numbered(keys.ravel())
     slice_ = csr_array(
         (
             np.ascontiguousarray(shares.T).ravel(),
@@ -284,6 +320,30 @@ def _elevation(d: int) -> Floats32:
     return E.astype(np.float32)
 
 
+_HASH_FACTOR = np.int64(-7046029254386353131)
+"""2^64 over the golden ratio (odd): Fibonacci hashing by the top bits of the product."""
+
+
+def _numbered(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """``np.unique(keys, return_inverse=True)``, several times faster where most keys occur often.
+
+    All equal keys meet in one bucket; whoever was written there last stands for them if it is their equal. The few
+    whose bucket was taken by another key are their own stand-ins, and only the stand-ins are sorted.
+    """
+    bits = min(22, max(8, len(keys).bit_length() + 1))
+    bucket = (keys * _HASH_FACTOR).view(np.uint64) >> np.uint64(64 - bits)
+    own = np.arange(len(keys), dtype=np.int32)
+    taken = np.empty(1 << bits, dtype=np.int32)
+    taken[bucket] = own
+    stand_in = taken[bucket]
+    stand_in = np.where(keys[stand_in] == keys, stand_in, own)
+    chosen = np.flatnonzero(stand_in == own)
+    unique, inverse = np.unique(keys[chosen], return_inverse=True)
+    number = np.empty(len(keys), dtype=np.int64)
+    number[chosen] = inverse
+    return unique, number[stand_in]
+
+
 _KEY_LIMIT = 2**62
 """Keys are signed 64 bit; a factor of two is left for the neighbours' steps."""
 
@@ -321,19 +381,25 @@ def _blur_steps(vertices: NDArray[np.int64], strides: NDArray[np.int64]) -> list
 def _blur_matrix(there: NDArray[np.int64], found: NDArray[np.bool_]) -> csr_array:
     """I/2 + S/4 + S^T/4, where S takes vertex i from vertex ``there[i]`` if ``found[i]``."""
     count = len(there)
-    back = np.full(count, -1, dtype=np.int32)
-    back[there[found]] = np.flatnonzero(found)
-    columns = np.stack([np.arange(count), np.where(found, there, -1), back], axis=1).astype(np.int32)
-    present = columns >= 0
-    ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int32)
-    values = np.broadcast_to(np.array([0.5, 0.25, 0.25], np.float32), columns.shape)
-    return csr_array((values[present], columns[present], ends), shape=(count, count))
+    own = np.arange(count, dtype=np.int32)
+    columns = np.repeat(own[:, None], 3, axis=1)
+    values = np.zeros((count, 3), dtype=np.float32)
+    values[:, 0] = 0.5
+    columns[:, 1] = there
+    values[:, 1] = np.float32(0.25) * found
+    ahead = there[found]
+    columns[ahead, 2] = own[found]
+    values[ahead, 2] = 0.25
+    ends = np.arange(0, 3 * count + 1, 3, dtype=np.int32)
+    return csr_array((values.ravel(), columns.ravel(), ends), shape=(count, count))
 
 
 def _require_widths(*widths: float) -> None:
     for width in widths:
         if not (np.isfinite(width) and width > 0):
-            raise RigError(f"kernel width {width} of the CRF is not positive", hint="px or grey levels above 0")
+            raise RigError(
+                f"kernel width {width} of the CRF is not positive", hint="px or grey levels above 0"
+            )
 
 
 def _require_compat(compat: float) -> None:

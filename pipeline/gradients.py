@@ -1,0 +1,141 @@
+"""Oriented, saturated image gradients at several scales: what the edges of the cloud are compared with.
+
+A gradient is divided by its neighbourhood's mean, so that a dark street counts like a sunny one, and saturated, so
+that one strong border does not outvote the rest. All widths are angles: they follow the focal length.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.records import CameraImage, CameraModel, Floats
+
+ORIENTATIONS = 4
+"""Steps of 45 degrees: the response is a squared cosine, so linear interpolation between them is close."""
+
+LEVELS = 3
+"""Scales per image; each is half of the one before."""
+
+FOCAL_PX = 720.0
+"""Focal length that the widths below are stated at."""
+
+_LARGEST_FOCAL_PX = 900.0
+"""Above it the image is shrunk to FOCAL_PX: 0.08 deg per pixel is finer than the edges of a LiDAR."""
+
+_BLUR_PX = 1.2
+"""Blur of the grey image before its gradient."""
+
+_NEIGHBOURHOOD_PX = 61.0
+"""Box over which gradients are normalised, 4.9 deg: wider than a lamp post, narrower than a car."""
+
+_NOISE_FLOOR = 1.0
+"""Grey levels a pixel, added to the normaliser: flat areas stay flat."""
+
+_LEVEL_BLUR_PX = 1.5
+"""Blur of the response at each level: 0.12, 0.24, 0.48 deg at levels 0, 1, 2."""
+
+_SATURATION = 2.0
+"""Normalised squared gradient at which the response reaches half of its largest value."""
+
+_FULL_SCALE = 1.5
+"""Largest response."""
+
+COUNTS = 40000.0
+"""uint16 counts per unit response: 60000 at full scale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GradientPyramid:
+    """Oriented gradients of one image.
+
+    Attributes:
+        levels: For each level uint16 (4,h,w): response to a step along 0, 45, 90, 135 degrees (u right, v down),
+            in units of 1/COUNTS.
+        scales: For each level (sx, sy): level px = (image px + 0.5) * s - 0.5.
+    """
+
+    levels: tuple[NDArray[np.uint16], ...]
+    scales: tuple[tuple[float, float], ...]
+
+
+def gradient_pyramid(image: CameraImage, camera: CameraModel) -> GradientPyramid:
+    """Oriented gradients of ``image`` at LEVELS scales (PROBE section 1, image)."""
+    focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
+    grey = cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY)
+    height, width = grey.shape
+    shrink = FOCAL_PX / focal if focal > _LARGEST_FOCAL_PX else 1.0
+    if shrink < 1.0:
+        size = (max(8, round(width * shrink)), max(8, round(height * shrink)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    unit = focal * shrink / FOCAL_PX
+    response = _responses(grey.astype(np.float32), unit)
+    levels, scales = [], []
+    for _ in range(LEVELS):
+        blurred = [cv2.GaussianBlur(r, (0, 0), _LEVEL_BLUR_PX * unit) for r in response]
+        levels.append(np.stack([(b * COUNTS).astype(np.uint16) for b in blurred]))
+        h, w = response[0].shape[:2]
+        scales.append((w / width, h / height))
+        half = (max(2, w // 2), max(2, h // 2))
+        response = [cv2.resize(r, half, interpolation=cv2.INTER_AREA) for r in response]
+    return GradientPyramid(tuple(levels), tuple(scales))
+
+
+def _responses(grey: NDArray[np.float32], unit: float) -> list[NDArray[np.float32]]:
+    """Saturated squared directional gradients, four float32 (h,w) in 0..1.5."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX * unit)
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1.0 / 8.0)
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1.0 / 8.0)
+    box = max(3, round(_NEIGHBOURHOOD_PX * unit))
+    norm = cv2.blur(cv2.magnitude(gx, gy), (box, box)) + np.float32(_NOISE_FLOOR)
+    gx /= norm
+    gy /= norm
+    found = []
+    for k in range(ORIENTATIONS):
+        c, s = math.cos(k * math.pi / ORIENTATIONS), math.sin(k * math.pi / ORIENTATIONS)
+        squared = np.square(np.float32(c) * gx + np.float32(s) * gy)
+        found.append(np.asarray(_FULL_SCALE * squared / (squared + _SATURATION), dtype=np.float32))
+    return found
+
+
+def sample(
+    stack: NDArray[np.uint16], slot: NDArray[np.int64], uv: Floats, angle: Floats, scale: tuple[float, float]
+) -> tuple[Floats, Floats]:
+    """Response and its gradient at image pixels, bilinear in place and linear in orientation.
+
+    Args:
+        stack: uint16 (F,4,h,w), the same level of F images.
+        slot: int64 (N,), image of each sample.
+        uv: float64 (N,2), image px.
+        angle: float64 (N,), direction of the step in the image, rad (taken modulo pi).
+        scale: (sx, sy) of the level.
+
+    Returns:
+        Response (N,), and its derivative by image px (N,2), with the orientation held; outside the image the border's
+        value and derivative 0.
+    """
+    h, w = stack.shape[2:]
+    x = (uv[:, 0] + 0.5) * scale[0] - 0.5
+    y = (uv[:, 1] + 0.5) * scale[1] - 0.5
+    x_in, y_in = np.clip(x, 0.0, w - 1.001), np.clip(y, 0.0, h - 1.001)
+    x0, y0 = x_in.astype(np.int64), y_in.astype(np.int64)
+    fx, fy = x_in - x0, y_in - y0
+    turn = np.mod(angle, math.pi) * (ORIENTATIONS / math.pi)
+    o0 = turn.astype(np.int64) % ORIENTATIONS
+    fo = turn - np.floor(turn)
+    flat = stack.reshape(-1)
+    taps = np.zeros((4, len(x)))
+    for o, weight in ((o0, 1.0 - fo), ((o0 + 1) % ORIENTATIONS, fo)):
+        base = ((slot * ORIENTATIONS + o) * h + y0) * w + x0
+        for tap, offset in enumerate((0, 1, w, w + 1)):
+            taps[tap] += weight * flat.take(base + offset)
+    taps /= COUNTS
+    top = taps[0] + fx * (taps[1] - taps[0])
+    bottom = taps[2] + fx * (taps[3] - taps[2])
+    value = top + fy * (bottom - top)
+    du = ((1.0 - fy) * (taps[1] - taps[0]) + fy * (taps[3] - taps[2])) * scale[0]
+    dv = (bottom - top) * scale[1]
+    slope = np.column_stack([np.where(x == x_in, du, 0.0), np.where(y == y_in, dv, 0.0)])
+    return value, slope

@@ -1,0 +1,294 @@
+"""Extrinsics from matched 3-D and image lines: PLK-Calib methods I and II with corrected equations (FORMULAS C, D).
+
+Method I minimises the distances of the image lines' ends from the projected cloud lines over all six degrees of
+freedom; it is the maximum-likelihood answer. Method II finds the rotation from directions and the translation
+linearly after it; it needs no good start and serves as one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import se3
+from pipeline.records import Floats
+
+HUBER = 2.5
+"""Whitened end-point distance beyond which a line's weight falls: 96 % of good lines (Rayleigh) keep weight 1."""
+
+STEP_SCALE = np.array([0.01] * 3 + [0.1] * 3)
+"""rad and m; makes the steps of the solvers comparable: 1 cm of sight at 1 m, 10 cm at 10 m."""
+
+_MAX_STEPS = 60
+_CONVERGED = 1e-13
+"""Step in units of STEP_SCALE below which the solvers stop."""
+
+_MIN_DAMPING = 1e-10
+"""Relative to the largest curvature: keeps null directions where they are, slows no observed one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinePairs:
+    """Matched lines as arrays, restricted to what image and cloud both see of them.
+
+    Attributes:
+        start: float64 (N,3), metres, LiDAR frame: one end of each cloud line.
+        end: float64 (N,3), the other end.
+        image_start: float64 (N,2), px of the ideal image.
+        image_end: float64 (N,2), likewise.
+        covariance: float64 (N,2,2), px^2, of the two end distances (S_n of FORMULAS D1).
+    """
+
+    start: Floats
+    end: Floats
+    image_start: Floats
+    image_end: Floats
+    covariance: Floats
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A Gaussian belief about the extrinsic.
+
+    Attributes:
+        T_cam_lidar: float64 (4,4), its mean.
+        precision: float64 (6,6), inverse covariance of (phi, rho) against the mean.
+    """
+
+    T_cam_lidar: Floats
+    precision: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Result of method I.
+
+    Attributes:
+        T_cam_lidar: float64 (4,4).
+        information: float64 (6,6), of (phi, rho) at the solution, from the lines alone (FORMULAS D2).
+        gradient: float64 (6,), of the lines alone at the solution, -sum J^T S^-1 r; zero without a prior.
+        distances: float64 (N,), whitened distance of each line.
+        chi2: Squared whitened distances, Huber weighted, per degree of freedom; 1 where there is none to spare.
+    """
+
+    T_cam_lidar: Floats
+    information: Floats
+    gradient: Floats
+    distances: Floats
+    chi2: float
+
+
+def stack(parts: Sequence[LinePairs]) -> LinePairs:
+    """All lines of several frames as one set."""
+    return LinePairs(
+        np.concatenate([part.start for part in parts]),
+        np.concatenate([part.end for part in parts]),
+        np.concatenate([part.image_start for part in parts]),
+        np.concatenate([part.image_end for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+    )
+
+
+def line_matrix(K: Floats) -> Floats:
+    """K_line = det(K) K^-T, which maps plane normals to image lines (PLK (3))."""
+    return np.asarray(np.linalg.det(K) * np.linalg.inv(K).T)
+
+
+def plucker(start: Floats, end: Floats) -> tuple[Floats, Floats]:
+    """Moments and unit directions (N,3) of the lines through two points (N,3) each (PLK (1), both normalised)."""
+    span = end - start
+    length = np.linalg.norm(span, axis=1, keepdims=True)
+    return np.cross(start, end) / length, span / length
+
+
+def _in_camera(pairs: LinePairs, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
+    """Moments and directions (N,3) in the camera frame (PLK (2))."""
+    n, v = plucker(pairs.start, pairs.end)
+    R, t = T_cam_lidar[:3, :3], T_cam_lidar[:3, 3]
+    v_cam = v @ R.T
+    return n @ R.T + np.cross(t, v_cam), v_cam
+
+
+def residuals(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
+    """Signed distances (N,2), px, of both image ends from the projected line (PLK (4), second end corrected)."""
+    n_cam, _ = _in_camera(pairs, T_cam_lidar)
+    line = n_cam @ line_matrix(K).T
+    norm = np.hypot(line[:, 0], line[:, 1])
+    return _ends_times(pairs, line) / norm[:, None]
+
+
+def jacobians(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
+    """d residual / d (phi, rho), (N,2,6): PLK (6) with the signs of the left perturbation (FORMULAS C (6))."""
+    n_cam, v_cam = _in_camera(pairs, T_cam_lidar)
+    K_line = line_matrix(K)
+    line = n_cam @ K_line.T
+    norm = np.hypot(line[:, 0], line[:, 1])
+    flat = line * [1.0, 1.0, 0.0]
+    product = _ends_times(pairs, line)
+    ends = np.stack([_homogeneous(pairs.image_start), _homogeneous(pairs.image_end)], axis=1)
+    d_line = (ends - (product / norm[:, None] ** 2)[:, :, None] * flat[:, None, :]) / norm[:, None, None]
+    d_normal = d_line @ K_line
+    # -a^T [n] = (n x a)^T for each row a.
+    d_phi = np.cross(n_cam[:, None, :], d_normal)
+    d_rho = np.cross(v_cam[:, None, :], d_normal)
+    return np.concatenate([d_phi, d_rho], axis=2)
+
+
+def _ends_times(pairs: LinePairs, line: Floats) -> Floats:
+    ends = np.stack([_homogeneous(pairs.image_start), _homogeneous(pairs.image_end)], axis=1)
+    return np.asarray(np.einsum("nki,ni->nk", ends, line))
+
+
+def _homogeneous(uv: Floats) -> Floats:
+    return np.column_stack([uv, np.ones(len(uv))])
+
+
+def plane_normals(pairs: LinePairs, K: Floats) -> Floats:
+    """Unit normals (N,3), camera frame, of the planes through the camera and the image lines (PLK (7), n' = K^T l')."""
+    line = np.cross(_homogeneous(pairs.image_start), _homogeneous(pairs.image_end))
+    normal = line @ K
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
+    """PLK-Calib method II: rotation from directions, then translation linearly (FORMULAS C (10)-(14), C7).
+
+    Stage 1 minimises the weighted sines ``n'^T R v``; stage 2 solves ``n'.t = -n'.(R p_m)``, the scalar form, since
+    the printed matrix form is biased.
+
+    Args:
+        pairs: At least three lines.
+        K: float64 (3,3), px.
+        T_start: Where the rotation starts and the weights are taken.
+
+    Returns:
+        The extrinsic, or None where directions or planes leave a freedom (parallel or concurrent lines).
+    """
+    if len(pairs) < 3:
+        return None
+    normal = plane_normals(pairs, K)
+    _, v = plucker(pairs.start, pairs.end)
+    sigma_sine, sigma_offset = _stage_sigmas(pairs, K, T_start)
+    R = T_start[:3, :3]
+    for _ in range(_MAX_STEPS):
+        v_cam = v @ R.T
+        J = np.cross(v_cam, normal) / sigma_sine[:, None]
+        r = np.einsum("ni,ni->n", normal, v_cam) / sigma_sine
+        H = J.T @ J
+        spectrum = np.linalg.eigvalsh(H)
+        if spectrum[0] < 1e-9 * spectrum[2]:
+            return None
+        phi = -np.linalg.solve(H, J.T @ r)
+        # The sine is not linear over more than half a radian; a longer step overshoots.
+        phi *= min(1.0, 0.5 / max(float(np.linalg.norm(phi)), 1e-12))
+        R = se3.exp_so3(phi) @ R
+        if np.abs(phi).max() < _CONVERGED:
+            break
+    A = normal / sigma_offset[:, None]
+    if np.linalg.matrix_rank(A, tol=1e-9 * float(np.linalg.norm(A))) < 3:
+        return None
+    middle = 0.5 * (pairs.start + pairs.end) @ R.T
+    b = -np.einsum("ni,ni->n", normal, middle) / sigma_offset
+    t = np.linalg.lstsq(A, b, rcond=None)[0]
+    return se3.transform(se3.orthonormalised(R), t)
+
+
+def _stage_sigmas(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
+    """Standard deviations (N,) of the two stages' residuals: sine (FORMULAS C7) and offset in metres (C (14))."""
+    n_cam, _ = _in_camera(pairs, T_cam_lidar)
+    kappa = line_sensitivity(n_cam, K)
+    R, t = T_cam_lidar[2, :3], T_cam_lidar[2, 3]
+    # Only the weights: a depth that the start puts behind the camera counts as near.
+    depth = np.hypot(np.maximum(pairs.start @ R + t, 0.1), np.maximum(pairs.end @ R + t, 0.1))
+    length = np.linalg.norm(pairs.end - pairs.start, axis=1)
+    sigma_px = np.sqrt(np.trace(pairs.covariance, axis1=1, axis2=2) / 2)
+    return sigma_px * depth / (kappa * length), sigma_px * depth / (2 * kappa)
+
+
+def line_sensitivity(n_cam: Floats, K: Floats) -> Floats:
+    """kappa (N,), px: a 3-D point moved by d across the line at depth z moves the image line by kappa d / z (D1)."""
+    line = n_cam @ line_matrix(K).T
+    return np.asarray(
+        np.linalg.det(K) * np.linalg.norm(n_cam, axis=1) / np.maximum(np.hypot(line[:, 0], line[:, 1]), 1e-12)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations of method I at one extrinsic."""
+
+    cost: float
+    information: Floats
+    gradient: Floats
+    distances: Floats
+
+
+def _linearise(pairs: LinePairs, whitening: Floats, K: Floats, T_cam_lidar: Floats) -> _Normal:
+    """Robust cost (PLK (5), squared and weighted), information and gradient (FORMULAS D2)."""
+    r = np.einsum("nij,nj->ni", whitening, residuals(pairs, K, T_cam_lidar))
+    J = whitening @ jacobians(pairs, K, T_cam_lidar)
+    distance = np.hypot(r[:, 0], r[:, 1])
+    weight = np.minimum(1.0, HUBER / np.maximum(distance, 1e-12))
+    cost = np.where(distance <= HUBER, 0.5 * distance**2, HUBER * (distance - 0.5 * HUBER)).sum()
+    information = np.einsum("n,nki,nkj->ij", weight, J, J)
+    gradient = -np.einsum("n,nki,nk->i", weight, J, r)
+    return _Normal(float(cost), information, gradient, distance)
+
+
+def method_one(
+    pairs: LinePairs, K: Floats, T_start: Floats, *, prior: Prior | None = None, start_two: bool = True
+) -> Solution:
+    """PLK-Calib method I: Levenberg-Marquardt with a Huber loss on the end distances (PLK (5), corrected).
+
+    Args:
+        pairs: The matched lines; directions that they leave free stay where the start or the prior puts them.
+        K: float64 (3,3), px.
+        T_start: Where to start.
+        prior: Belief that takes part in the cost, but not in the information that is returned.
+        start_two: Also try the answer of method II as a start; the cheaper of the two is taken.
+
+    Returns:
+        The extrinsic with the information of the lines alone.
+    """
+    whitening = np.linalg.inv(np.linalg.cholesky(pairs.covariance))
+
+    def total(T: Floats) -> tuple[_Normal, float, Floats, Floats]:
+        lines = _linearise(pairs, whitening, K, T)
+        if prior is None:
+            return lines, lines.cost, lines.information, lines.gradient
+        xi = se3.local(prior.T_cam_lidar, T)
+        pull = prior.precision @ xi
+        return (
+            lines,
+            lines.cost + 0.5 * float(xi @ pull),
+            lines.information + prior.precision,
+            (lines.gradient - pull),
+        )
+
+    T, at = T_start, total(T_start)
+    two = method_two(pairs, K, T_start) if start_two else None
+    if two is not None and (candidate := total(two))[1] < at[1]:
+        T, at = two, candidate
+    damping = 1e-3
+    for _ in range(_MAX_STEPS):
+        H = at[2] * np.outer(STEP_SCALE, STEP_SCALE)
+        top = max(float(np.diag(H).max()), 1e-12)
+        step = np.linalg.solve(H + damping * top * np.eye(6), at[3] * STEP_SCALE)
+        T_next = se3.retract(T, step * STEP_SCALE)
+        candidate = total(T_next)
+        if candidate[1] <= at[1]:
+            T, at = T_next, candidate
+            damping = max(damping / 10, _MIN_DAMPING)
+        else:
+            damping *= 10
+        if np.abs(step).max() < _CONVERGED or damping > 1e6:
+            break
+    T = se3.transform(se3.orthonormalised(T[:3, :3]), T[:3, 3])
+    lines = at[0]
+    loss = np.minimum(lines.distances, HUBER) * lines.distances
+    freedom = 2 * len(pairs) - 6
+    chi2 = float(loss.sum() / freedom) if freedom > 0 else 1.0
+    return Solution(T, lines.information, lines.gradient, lines.distances, chi2)

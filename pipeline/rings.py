@@ -1,0 +1,202 @@
+"""The scan pattern of a spinning LiDAR, found in its own data: rings, order along them, steps between neighbours.
+
+Nothing is set per sensor. A ring number in the cloud is used where there is one; else rings are read off the order of
+the points (ring after ring) or off their elevation. A cloud without any such pattern gives None.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import se3
+from pipeline.records import Floats, PointCloud
+
+_FEWEST_RINGS, _MOST_RINGS = 4, 512
+"""Outside these numbers an order that was read off the data is no ring pattern."""
+
+_RING_STRAYS = 0.05
+"""Share of steps between points that may not go on along the ring: ends of rings, gaps, near objects."""
+
+_OWN_SHARE = 0.05
+"""Median distance of a point from its ring's elevation, as a share of the sensor's vertical field of view."""
+
+_LEVEL_SHARE = 0.03
+"""Share of the range by which neighbours on one surface differ at most."""
+
+_ELEVATION_BIN_RAD = math.radians(0.02)
+"""Bin of the elevation histogram; a tenth of the closest ring spacing on sale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPattern:
+    """Points ordered by ring from the lowest to the highest, and along each ring by azimuth.
+
+    Attributes:
+        index: int64 (M,), index of each ordered point in the cloud.
+        ring: int64 (M,), rank of its ring by elevation, 0 lowest.
+        azimuth: float64 (M,), rad about the spin axis, growing inside a ring.
+        elevation: float64 (M,), rad above the plane across the spin axis.
+        distance: float64 (M,), range from the sensor, m.
+        azimuth_step: Median angle between neighbours on a ring, rad.
+        ring_spacing: Median angle between neighbouring rings, rad.
+    """
+
+    index: NDArray[np.int64]
+    ring: NDArray[np.int64]
+    azimuth: Floats
+    elevation: Floats
+    distance: Floats
+    azimuth_step: float
+    ring_spacing: float
+
+
+def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | None:
+    """Orders the points that ``keep`` (N,) marks; None where the cloud shows no rings.
+
+    The sensor is taken to stand at the origin of the cloud's frame and to spin about its z axis; a cloud in another
+    frame is turned and moved before (the ring number and the order of points do not mind).
+    """
+    ring = _rings(cloud)
+    if ring is None:
+        return None
+    chosen = np.flatnonzero(keep & (ring >= 0))
+    if chosen.size < _FEWEST_RINGS:
+        return None
+    xyz = cloud.xyz[chosen].astype(np.float64)
+    flat = np.hypot(xyz[:, 0], xyz[:, 1])
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    # The cut of the circle is laid where no point is: opposite to the middle of what is kept.
+    middle = math.atan2(float(np.sin(azimuth).mean()), float(np.cos(azimuth).mean()))
+    azimuth = np.mod(azimuth - middle + math.pi, 2.0 * math.pi)
+    elevation = np.arctan2(xyz[:, 2], flat)
+    rank = _rank_by_elevation(ring[chosen], elevation)
+    order = np.lexsort((azimuth, rank))
+    rank, azimuth = rank[order], azimuth[order]
+    step = np.diff(azimuth)[np.diff(rank) == 0]
+    step = step[step > 1e-6]
+    medians = _medians(elevation[order], rank)
+    spacing = np.diff(medians)
+    if step.size == 0 or spacing.size == 0:
+        return None
+    return ScanPattern(
+        index=chosen[order],
+        ring=rank,
+        azimuth=azimuth,
+        elevation=elevation[order],
+        distance=np.hypot(flat, xyz[:, 2])[order],
+        azimuth_step=float(np.median(step)),
+        ring_spacing=float(np.median(spacing)),
+    )
+
+
+def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
+    """A ring number for each point (-1: none), from the cloud's own field, its order or its elevations."""
+    if cloud.ring is not None and len(cloud) and int(cloud.ring.max()) > 0:
+        return cloud.ring.astype(np.int64)
+    if len(cloud) < _FEWEST_RINGS:
+        return None
+    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0]).astype(np.float64)
+    elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])).astype(np.float64)
+    by_order = _rings_by_order(azimuth, elevation, np.linalg.norm(cloud.xyz, axis=1).astype(np.float64))
+    if by_order is not None and _believable(by_order, elevation):
+        return by_order
+    by_elevation = _rings_by_elevation(elevation)
+    if by_elevation is not None and _believable(by_elevation, elevation):
+        return by_elevation
+    return None
+
+
+def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDArray[np.int64] | None:
+    """Ring number where the file holds ring after ring: each turn of the azimuth begins a new one."""
+    step = np.mod(np.diff(azimuth) + math.pi, 2.0 * math.pi) - math.pi
+    sense = math.copysign(1.0, float(np.median(step)))
+    step = step * sense
+    # Ring after ring means small steps forward nearly always; column after column does not.
+    if float(np.mean((step > -1e-3) & (step < math.radians(5.0)))) < 1.0 - _RING_STRAYS:
+        return None
+    backward = step < -math.radians(20.0)
+    travelled = np.concatenate([[0.0], np.cumsum(np.where(backward, 0.0, step))])
+    count = travelled[-1] / (2.0 * math.pi) + int(backward.sum())
+    if not _FEWEST_RINGS <= count <= _MOST_RINGS:
+        return None
+    seam = _seam(np.mod(azimuth * sense, 2.0 * math.pi), elevation, distance)
+    turns = (travelled + azimuth[0] * sense - seam) / (2.0 * math.pi)
+    ring = np.floor(turns).astype(np.int64) + np.concatenate([[0], np.cumsum(backward)])
+    ring -= ring[0]
+    # Where a ring ends and the next begins a point's ring is not sure, and no edge may be seen between the two.
+    unsure = np.abs(turns - np.rint(turns)) * 2.0 * math.pi < 2.0 * float(np.median(step))
+    return np.where(unsure, -1, ring)
+
+
+def _seam(azimuth: Floats, elevation: Floats, distance: Floats) -> float:
+    """Azimuth in 0..2 pi at which one ring ends and the next begins: there the elevation jumps, turn after turn.
+
+    Inside a ring it jumps only where the range does (lasers sit some centimetres apart) and comes back, so steps
+    of range are left out and the rest is summed with its sign.
+    """
+    change = np.diff(elevation)
+    turns = max(1.0, float(np.sum(np.abs(np.diff(azimuth)) > math.pi)))
+    spacing = float(np.ptp(elevation)) / turns
+    level = np.abs(np.diff(distance)) < _LEVEL_SHARE * distance[1:]
+    jumps = level & (np.abs(change) > 0.25 * spacing) & (np.abs(change) < 5.0 * spacing)
+    sums, borders = np.histogram(
+        azimuth[1:][jumps], bins=720, range=(0.0, 2.0 * math.pi), weights=change[jumps]
+    )
+    best = int(np.argmax(np.abs(sums + np.roll(sums, 1) + np.roll(sums, -1))))
+    offset = np.mod(azimuth[1:] - borders[best] + math.pi, 2.0 * math.pi) - math.pi
+    near = jumps & (np.abs(offset) < 2.0 * (borders[1] - borders[0]))
+    return float(np.mod(borders[best] + (np.median(offset[near]) if near.any() else 0.0), 2.0 * math.pi))
+
+
+def _rings_by_elevation(elevation: Floats) -> NDArray[np.int64] | None:
+    """Ring number where each laser keeps its elevation: peaks of the histogram, parted at its valleys."""
+    low, high = float(elevation.min()), float(elevation.max())
+    bins = max(8, int((high - low) / _ELEVATION_BIN_RAD))
+    counts, borders = np.histogram(elevation, bins=bins)
+    smooth = np.convolve(counts, [0.25, 0.5, 0.25], mode="same")
+    filled = smooth > 0.1 * np.median(smooth[smooth > 0]) if (smooth > 0).any() else smooth > 0
+    rising = np.flatnonzero(np.diff(np.concatenate([[0], filled.astype(np.int8)])) == 1)
+    if not _FEWEST_RINGS <= rising.size <= _MOST_RINGS:
+        return None
+    return np.searchsorted(borders[rising], elevation, side="right").astype(np.int64) - 1
+
+
+def _believable(ring: NDArray[np.int64], elevation: Floats) -> bool:
+    """Whether the points of a ring keep to its elevation better than to those of other rings.
+
+    Judged by the median point: lasers sit some centimetres apart, which bends a ring by degrees on near objects.
+    """
+    sure = ring >= 0
+    ring, elevation = ring[sure], elevation[sure]
+    order = np.argsort(ring, kind="stable")
+    medians = _medians(elevation[order], ring[order])
+    medians = medians[np.isfinite(medians)]
+    own = np.median(np.abs(elevation - _medians(elevation[order], ring[order])[ring]))
+    return bool(own < _OWN_SHARE * np.ptp(medians) and len(medians) >= _FEWEST_RINGS)
+
+
+def _medians(values: Floats, group: NDArray[np.int64], count: int | None = None) -> Floats:
+    """Median of ``values`` for each group number; ``group`` is sorted. NaN for a number that is absent."""
+    size = int(group[-1]) + 1 if count is None else count
+    starts = np.searchsorted(group, np.arange(size + 1))
+    return np.array(
+        [np.median(values[a:b]) if b > a else np.nan for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    )
+
+
+def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> NDArray[np.int64]:
+    """Ring numbers replaced by their rank from the lowest to the highest ring, whatever the sensor's own order."""
+    names, inverse = np.unique(ring, return_inverse=True)
+    order = np.argsort(inverse, kind="stable")
+    medians = _medians(elevation[order], inverse[order], len(names))
+    rank = np.empty(len(names), dtype=np.int64)
+    rank[np.argsort(medians)] = np.arange(len(names))
+    return rank[inverse]
+
+
+def sensor_frame(T_frame_sensor: Floats, cloud: PointCloud) -> PointCloud:
+    """The cloud in the frame of its sensor, where the scan pattern is what it was when it was measured."""
+    xyz = se3.apply(se3.inverse(T_frame_sensor), cloud.xyz).astype(np.float32)
+    return PointCloud(xyz, cloud.intensity, cloud.ring, cloud.time)

@@ -1,0 +1,210 @@
+"""Named columns of any numeric type -> :class:`~pipeline.records.PointCloud`: one reading for every format.
+
+Field names are compared in lower case. What a field means is settled here and nowhere else:
+
+- ``x y z``: metres. Points that are not finite and returns at exactly (0, 0, 0), by which sensors mark a
+  beam without an echo, are dropped from every array together.
+- intensity (:data:`INTENSITY`, the first that exists): 0..1. uint8 is divided by 255. Otherwise the 99.9 %
+  quantile q of the valid points decides: floats with q <= 1 stand as they are, anything else with q <= 255
+  is divided by 255, larger values (signal counts) are divided by q; then all is clipped to 0..1. The
+  quantile, not the largest value: a few retroreflectors beyond the nominal scale must not change it.
+- ring (:data:`RING`): kept where every valid point has a whole number in 0..65535.
+- time (:data:`TIME`): see :func:`seconds_after`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor.messages import Codec
+from pipeline.errors import InputError
+from pipeline.records import PointCloud
+
+CODECS: dict[str, Codec] = {}
+"""This module is shared by those of the point clouds and decodes no type by itself."""
+
+Column: TypeAlias = NDArray[Any]
+
+INTENSITY = ("intensity", "i", "reflectivity", "reflectance")
+RING = ("ring", "channel", "laser_id", "line", "laser", "beam")
+TIME = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
+
+QUANTILE = 0.999
+"""Share of points that may lie beyond the nominal intensity scale: retroreflectors and glitches."""
+
+LONGEST_SWEEP_S = 2.0
+"""s; spinning sensors take 0.05 to 0.2 s, slow scanners up to 1 s. A span beyond it is read in a finer unit,
+or not."""
+
+_ABSOLUTE_SCALES = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
+"""Smallest value and ns per unit of clocks counted from 1970 in ns, us, ms, s: every date from 1973 to
+5138."""
+
+
+class Field(NamedTuple):
+    """Where a field stands in a packed point: ``dtype`` carries the byte order, ``offset`` is in bytes."""
+
+    name: str
+    offset: int
+    dtype: np.dtype[Any]
+
+
+class Packing(NamedTuple):
+    """How points lie in a buffer: ``height`` rows of ``width`` points; steps in bytes."""
+
+    width: int
+    height: int
+    point_step: int
+    row_step: int
+    fields: Sequence[Field]
+
+
+def packed_columns(data: memoryview | NDArray[np.uint8], packing: Packing) -> dict[str, Column]:
+    """Views of the fields that :func:`cloud_of` knows, 1-D, in the order of the points.
+
+    Raises:
+        InputError: A field or row does not fit, or the data are shorter than declared.
+    """
+    width, height, point_step, row_step, fields = packing
+    if row_step < width * point_step:
+        raise InputError(f"rows of {row_step} bytes can not hold {width} points of {point_step} bytes")
+    needed = (height - 1) * row_step + width * point_step if width and height else 0
+    if len(data) < needed:
+        raise InputError(
+            f"{height}x{width} points of {point_step} bytes need {needed} bytes, the data have {len(data)}",
+            hint="the message was cut short",
+        )
+    columns: dict[str, Column] = {}
+    for field in fields:
+        name = field.name.lower()
+        if name in columns or name not in ("x", "y", "z", *INTENSITY, *RING, *TIME):
+            continue
+        end = field.offset + field.dtype.itemsize
+        if end > point_step:
+            raise InputError(f"field '{field.name}' ends at byte {end} of a point of {point_step}")
+        if needed == 0:
+            columns[name] = np.empty(0, field.dtype)
+            continue
+        columns[name] = np.ndarray(
+            (height, width), field.dtype, buffer=data, offset=field.offset, strides=(row_step, point_step)
+        ).reshape(-1)
+    return columns
+
+
+def cloud_of(columns: Mapping[str, Column], stamp_ns: int) -> PointCloud:
+    """The cloud that named columns of equal length describe; owns its arrays.
+
+    Args:
+        columns: Lower-case field name -> (N,) of any integer or float type and byte order; others are
+            ignored.
+        stamp_ns: Stamp of the sweep, ns: times are told relative to it.
+
+    Raises:
+        InputError: x, y or z is missing.
+    """
+    missing = [axis for axis in "xyz" if axis not in columns]
+    if missing:
+        raise InputError(
+            f"the cloud has no field {', '.join(missing)}",
+            hint=f"its fields are {', '.join(sorted(columns)) or 'none that is known'}",
+        )
+    xyz = np.empty((len(columns["x"]), 3), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf, which is dropped
+        for axis, name in enumerate("xyz"):
+            xyz[:, axis] = columns[name]
+    keep = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    keep &= (xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0)
+    if keep.all():
+        chosen: NDArray[np.intp] | slice = slice(None)
+    else:
+        chosen = np.flatnonzero(keep)
+        xyz = xyz[chosen]
+
+    def first(names: tuple[str, ...]) -> Column | None:
+        return next((columns[name][chosen] for name in names if name in columns), None)
+
+    intensity, ring, time = first(INTENSITY), first(RING), first(TIME)
+    return PointCloud(
+        xyz,
+        None if intensity is None else unit_intensity(intensity),
+        None if ring is None else _whole(ring),
+        None if time is None else seconds_after(time, stamp_ns),
+    )
+
+
+def unit_intensity(values: Column) -> NDArray[np.float32]:
+    """Intensities of any type and scale as float32 in 0..1, by the rule at the head of this module."""
+    if values.dtype == np.uint8:
+        return values.astype(np.float32) / np.float32(255)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = values.astype(np.float32)
+    if not np.isfinite(found).all():
+        found = np.where(np.isfinite(found), found, np.float32(0))
+    if not len(found):
+        return found
+    rank = int(QUANTILE * (len(found) - 1))
+    top = float(np.partition(found, rank)[rank])
+    if not (values.dtype.kind == "f" and top <= 1):
+        found /= np.float32(max(top, 255.0)) if top > 255 else np.float32(255)
+    return np.clip(found, 0, 1, out=found)
+
+
+def _whole(values: Column) -> NDArray[np.uint16] | None:
+    if values.dtype.kind == "f" and not (np.isfinite(values).all() and (values == np.floor(values)).all()):
+        return None
+    if len(values) and not (values.min() >= 0 and values.max() <= np.iinfo(np.uint16).max):
+        return None
+    return values.astype(np.uint16)
+
+
+def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
+    """Times of points in seconds after the stamp of the sweep, or None where they tell nothing.
+
+    Integers count ns, floats s; floats that span more than :data:`LONGEST_SWEEP_S` are read as ms, us or ns,
+    whichever makes a sweep of them. Clocks counted from 1970 (s, ms, us or ns by their size) are told
+    relative to ``stamp_ns``, or to their own earliest point where the two clocks are further apart than a
+    sweep lasts: LiDAR clocks often run on another epoch than the header's. Times that are all equal (a
+    converter's filler), not finite, or span more than a sweep in any unit say nothing.
+
+    Args:
+        values: (N,), any integer or float type.
+        stamp_ns: Stamp of the sweep, ns.
+    """
+    if not len(values):
+        return np.empty(0, np.float32)
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        return None
+    low, high = values.min(), values.max()
+    if low == high:
+        return None
+    scale = next((ns for least, ns in _ABSOLUTE_SCALES if low >= least), None)
+    if scale is not None and (values.dtype.kind == "f" or low >= 10**11):
+        origin = int(low)
+        after = _ns_after(values, origin, scale)
+        offset_ns = origin * scale - stamp_ns
+        if abs(offset_ns) > LONGEST_SWEEP_S * 1e9:
+            offset_ns = -int(after.min())
+    else:
+        after = _relative_ns(values, float(high) - float(low))
+        offset_ns = 0
+    if float(after.max()) - float(after.min()) > LONGEST_SWEEP_S * 1e9:
+        return None
+    return ((after + offset_ns) * 1e-9).astype(np.float32)
+
+
+def _ns_after(values: Column, origin: int, scale: int) -> NDArray[np.float64]:
+    """Nanoseconds since ``origin`` (whole units of ``scale`` ns): the difference first, so nothing rounds."""
+    if values.dtype.kind == "f":
+        return (values.astype(np.float64) - origin) * scale
+    after: NDArray[np.float64] = (values - np.array(origin, values.dtype)).astype(np.float64)
+    return after * scale
+
+
+def _relative_ns(values: Column, span: float) -> NDArray[np.float64]:
+    """Nanoseconds of times that count from the sweep's own stamp."""
+    if values.dtype.kind != "f":
+        return values.astype(np.float64)
+    unit_ns = next((ns for ns in (1e9, 1e6, 1e3) if span * ns <= LONGEST_SWEEP_S * 1e9), 1.0)
+    return values.astype(np.float64) * unit_ns

@@ -1,0 +1,548 @@
+"""The rig: which LiDAR goes with which camera, by which extrinsic (DESIGN 3).
+
+A rig comes from a rig file (TOML or JSON), from ``calib.json``, or from what a recording carries in itself
+(:mod:`monitor.discovery`). Degrees and milliseconds stand in files only; the values here are SI.
+"""
+
+import dataclasses
+import difflib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, field_validator
+
+from monitor.messages import CameraInfo
+from monitor.sources import TopicInfo
+from pipeline.errors import CalibwatchError, InputError, RigError
+from pipeline.records import AXES, CameraModel, Floats
+from pipeline.se3 import orthonormalised, stored_before
+
+NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+"""What a vehicle or pair may be called: one chunk of a key."""
+
+CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", "foxglove.PointCloud")
+"""Types that carry a sweep; folders give ``file/<suffix>``."""
+IMAGE_TYPES = (
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "foxglove.RawImage",
+    "foxglove.CompressedImage",
+)
+"""Types that carry an image; folders give ``file/<suffix>``."""
+CLOUD_SUFFIXES = ("bin", "npz", "pcd", "ply", "pcd.bin")
+IMAGE_SUFFIXES = ("png", "jpg")
+
+_ROUNDING = 1e-3
+"""Largest entry of ``R R^T - I`` that passes as rounding: six digits give 1e-5, a wrong matrix far more."""
+_LARGEST_FILE = 8 << 20
+"""bytes; a rig file is a few kB."""
+
+Axis: TypeAlias = Literal["roll", "pitch", "yaw", "forward", "left", "up"]
+Pairing: TypeAlias = Literal["stamps", "sequence"]
+SweepStamp: TypeAlias = Literal["start", "middle", "end"]
+_Name = Annotated[str, StringConstraints(pattern=rf"^{NAME.pattern}$")]
+_Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+_Matrix4 = Annotated[list[_Row], Field(min_length=4, max_length=4)]
+_Matrix3 = Annotated[
+    list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class LidarSection(_Section):
+    """Where the sweeps come from."""
+
+    topic: str | None = Field(
+        default=None, description="topic, key expression or folder; absent: the only one of its kind"
+    )
+    frame: str = Field(default="", description="frame id of the points, as tf names it")
+    type: str | None = Field(default=None, description="message type where the bus does not tell it")
+    spin: Literal["cw", "ccw"] | None = Field(
+        default=None, description="sense of rotation seen from above, for sweeps without times per point"
+    )
+    stamp: SweepStamp = Field(default="start", description="the instant of the sweep that its stamp means")
+
+
+class CameraSection(_Section):
+    """Where the images come from, and the intrinsics where no CameraInfo gives them."""
+
+    topic: str | None = Field(
+        default=None, description="topic, key expression or folder; absent: the only one of its kind"
+    )
+    info: str | None = Field(default=None, description="topic of its CameraInfo")
+    frame: str = Field(default="", description="optical frame id, as tf names it")
+    type: str | None = Field(default=None, description="message type where the bus does not tell it")
+    rectified: bool | None = Field(
+        default=None, description="whether P of CameraInfo holds (true) or K, D (false); absent: see spec"
+    )
+    model: str | None = Field(default=None, description="lens model, default plumb_bob, pinhole without D")
+    K: _Matrix3 | None = Field(default=None, description="camera matrix, px")
+    D: list[float] = Field(default=[], max_length=14, description="distortion in the order of OpenCV")
+    width: int | None = Field(default=None, gt=0, le=65536, json_schema_extra={"unit": "px"})
+    height: int | None = Field(default=None, gt=0, le=65536, json_schema_extra={"unit": "px"})
+
+
+class ExtrinsicSection(_Section):
+    """The stored extrinsic and how well it is known (C_ref of FORMULAS F2)."""
+
+    store: _Name | None = Field(default=None, description="name in the extrinsic store, in place of a matrix")
+    T_cam_lidar: _Matrix4 | None = Field(default=None, description="maps LiDAR points into the camera frame")
+    sigma_deg: float = Field(
+        default=0.1, gt=0, le=10, description="what a good target calibration reaches", json_schema_extra={"unit": "deg"}
+    )
+    sigma_m: float = Field(
+        default=0.02, gt=0, le=1, description="what a good target calibration reaches", json_schema_extra={"unit": "m"}
+    )
+
+
+class LimitsSection(_Section):
+    """Alert limits: what matters to this vehicle's perception (AL of FORMULAS D3, per axis)."""
+
+    roll_deg: float = Field(default=0.75, gt=0, le=45, json_schema_extra={"unit": "deg"})
+    pitch_deg: float = Field(default=0.5, gt=0, le=45, json_schema_extra={"unit": "deg"})
+    yaw_deg: float = Field(default=0.5, gt=0, le=45, json_schema_extra={"unit": "deg"})
+    forward_m: float = Field(default=0.20, gt=0, le=5, json_schema_extra={"unit": "m"})
+    left_m: float = Field(default=0.15, gt=0, le=5, json_schema_extra={"unit": "m"})
+    up_m: float = Field(default=0.15, gt=0, le=5, json_schema_extra={"unit": "m"})
+
+
+class PairSection(_Section):
+    """One LiDAR and one camera that watch the same scene."""
+
+    name: _Name
+    lidar: LidarSection = LidarSection()
+    camera: CameraSection = CameraSection()
+    max_gap_ms: float = Field(
+        default=50.0,
+        gt=0,
+        le=1000,
+        description="half a period of the usual 10 Hz: a nearer partner always exists when none is lost",
+        json_schema_extra={"unit": "ms"},
+    )
+    pairing: Pairing = Field(
+        default="stamps",
+        description="'sequence': image n goes with cloud n whatever the stamps say (folders that list pairs)",
+    )
+    extrinsic: ExtrinsicSection | None = Field(default=None, description="absent: taken from tf_static")
+    T_vehicle_lidar: _Matrix4 | None = Field(default=None, description="maps LiDAR points into base_link")
+    limits: LimitsSection = LimitsSection()
+    required: list[Axis] = Field(
+        default=["pitch", "yaw"], min_length=1, description="axes that must be monitored for 'healthy'"
+    )
+
+    @field_validator("extrinsic", mode="before")
+    @classmethod
+    def _from_store(cls, value: object) -> object:
+        if isinstance(value, str):
+            kind, _, name = value.partition(":")
+            if kind != "store":
+                raise ValueError('as text it is "store:NAME"')
+            return {"store": name}
+        return value
+
+
+class RigDocument(_Section):
+    """The rig file."""
+
+    vehicle: _Name = "vehicle"
+    pairs: list[PairSection] = Field(min_length=1, max_length=64)
+
+
+_SECTIONS: dict[str, type[_Section]] = {
+    "pairs": PairSection,
+    "lidar": LidarSection,
+    "camera": CameraSection,
+    "extrinsic": ExtrinsicSection,
+    "limits": LimitsSection,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarInput:
+    """Where sweeps come from.
+
+    Attributes:
+        topic: Topic, key expression or folder; None until :func:`bind` has chosen the only one.
+        frame: Frame id, or empty.
+        type: Message type where the bus does not tell it, or None.
+        spin: Sense of rotation seen from above, or None.
+        stamp: The instant of the sweep that its stamp means.
+    """
+
+    topic: str | None
+    frame: str
+    type: str | None
+    spin: Literal["cw", "ccw"] | None
+    stamp: SweepStamp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraInput:
+    """Where images come from.
+
+    Attributes:
+        topic: Topic, key expression or folder; None until :func:`bind` has chosen the only one.
+        info: Topic of CameraInfo, or None.
+        frame: Optical frame id, or empty.
+        type: Message type where the bus does not tell it, or None.
+        rectified: Whether P of CameraInfo holds; None: :func:`camera_from_info` decides.
+        model: Intrinsics, or None: CameraInfo gives them.
+    """
+
+    topic: str | None
+    info: str | None
+    frame: str
+    type: str | None
+    rectified: bool | None
+    model: CameraModel | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigPair:
+    """One LiDAR and one camera.
+
+    Attributes:
+        name: One chunk of a key.
+        lidar: Where sweeps come from.
+        camera: Where images come from.
+        T_cam_lidar: float64 (4,4), the stored extrinsic; None: from the store or from tf.
+        store: Name in the extrinsic store, or None.
+        T_vehicle_lidar: float64 (4,4), maps LiDAR points into the vehicle frame, or None.
+        sigma_rad: Uncertainty of the stored rotation, rad per axis.
+        sigma_m: Uncertainty of the stored translation, m per axis.
+        limits: float64 (6,), alert limits: roll, pitch, yaw rad, forward, left, up m.
+        required: Axes that must be monitored for 'healthy'.
+        max_gap_ns: Largest gap between a sweep's middle and its image, ns.
+        pairing: Whether stamps or sequence numbers tell what belongs together.
+    """
+
+    name: str
+    lidar: LidarInput
+    camera: CameraInput
+    T_cam_lidar: Floats | None
+    store: str | None
+    T_vehicle_lidar: Floats | None
+    sigma_rad: float
+    sigma_m: float
+    limits: Floats
+    required: tuple[Axis, ...]
+    max_gap_ns: int
+    pairing: Pairing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """One vehicle.
+
+    Attributes:
+        vehicle: One chunk of a key.
+        pairs: Its pairs, at least one, names unique.
+    """
+
+    vehicle: str
+    pairs: tuple[RigPair, ...]
+
+
+def load_rig(path: str | Path) -> Rig:
+    """The rig in a TOML or JSON file, or in ``calib.json``.
+
+    Raises:
+        RigError: The file can not be read or says something that is not understood; names the key.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise RigError(f"{path} has {path.stat().st_size} bytes, too many for a rig file")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RigError(
+            f"{path} can not be read: {error.strerror}", hint="--rig wants a .toml or .json file"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise RigError(f"{path} is not text", hint="--rig wants a .toml or .json file") from error
+    try:
+        document = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise RigError(f"{path} is not {path.suffix.lstrip('.') or 'json'}: {error}") from error
+    if not isinstance(document, dict):
+        raise RigError(f"{path} holds no table", hint="a rig file has 'vehicle' and 'pairs'")
+    return parse_rig(document, where=str(path))
+
+
+def parse_rig(document: Mapping[str, object], *, where: str) -> Rig:
+    """The rig that a document states: rig file or ``calib.json`` (DESIGN 3).
+
+    Args:
+        document: What the file holds.
+        where: Name of the file or recording, for messages.
+
+    Raises:
+        RigError: Names the key, and the nearest valid one where it is unknown.
+    """
+    if "pairs" not in document and "T_cam_lidar" in document:
+        document = calib_document(document, where=where)
+    try:
+        parsed = RigDocument.model_validate(document)
+    except ValidationError as error:
+        raise _refusal(error, where) from error
+    names = [pair.name for pair in parsed.pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise RigError(f"{where}: two pairs are called '{name}'", hint="names of pairs are unique")
+    return Rig(
+        vehicle=parsed.vehicle,
+        pairs=tuple(_pair(pair, f"{where}: pairs[{i}]") for i, pair in enumerate(parsed.pairs)),
+    )
+
+
+def calib_document(
+    calib: Mapping[str, object],
+    *,
+    where: str,
+    lidar: str | None = None,
+    camera: str | None = None,
+    name: str | None = None,
+    pairing: Pairing = "stamps",
+) -> dict[str, object]:
+    """``calib.json`` (``camera``, ``T_cam_lidar``; other keys are notes) in the form of the rig file.
+
+    Args:
+        calib: What ``calib.json`` holds.
+        where: Name of the file, for messages.
+        lidar: Topic of the clouds, or None: the only one.
+        camera: Topic of the images, or None: the only one.
+        name: Name of the pair; default ``camera_name`` of the file, else "camera".
+        pairing: Whether stamps or sequence numbers tell what belongs together.
+    """
+    lens = calib.get("camera")
+    if not isinstance(lens, Mapping) or "T_cam_lidar" not in calib:
+        raise RigError(f"{where} has no 'camera' and 'T_cam_lidar'", hint="calib.json needs both")
+    section = {key: lens[key] for key in ("width", "height", "K") if key in lens}
+    coefficients = lens.get("D") or []
+    model = lens.get("distortion_model") or "none"
+    section |= {"D": coefficients, "model": "pinhole" if model == "none" else model}
+    own_name = calib.get("camera_name", "camera")
+    pair: dict[str, object] = {
+        "name": name or own_name,
+        "lidar": {"topic": lidar},
+        "camera": {**section, "topic": camera},
+        "extrinsic": {"T_cam_lidar": calib["T_cam_lidar"]},
+        "pairing": pairing,
+    }
+    if "T_vehicle_lidar" in calib:
+        pair["T_vehicle_lidar"] = calib["T_vehicle_lidar"]
+    return {"pairs": [pair]}
+
+
+def _pair(section: PairSection, where: str) -> RigPair:
+    extrinsic = section.extrinsic or ExtrinsicSection()
+    if extrinsic.store is not None and extrinsic.T_cam_lidar is not None:
+        raise RigError(f"{where}.extrinsic has 'store' and 'T_cam_lidar'", hint="give one of them")
+    limits = section.limits
+    degrees = (limits.roll_deg, limits.pitch_deg, limits.yaw_deg)
+    return RigPair(
+        name=section.name,
+        lidar=LidarInput(**section.lidar.model_dump()),
+        camera=CameraInput(
+            topic=section.camera.topic,
+            info=section.camera.info,
+            frame=section.camera.frame,
+            type=section.camera.type,
+            rectified=section.camera.rectified,
+            model=_camera_model(section.camera, f"{where}.camera"),
+        ),
+        T_cam_lidar=_rigid(extrinsic.T_cam_lidar, f"{where}.extrinsic.T_cam_lidar"),
+        store=extrinsic.store,
+        T_vehicle_lidar=_rigid(section.T_vehicle_lidar, f"{where}.T_vehicle_lidar"),
+        sigma_rad=math.radians(extrinsic.sigma_deg),
+        sigma_m=extrinsic.sigma_m,
+        limits=np.array([*map(math.radians, degrees), limits.forward_m, limits.left_m, limits.up_m]),
+        required=tuple(section.required),
+        max_gap_ns=round(section.max_gap_ms * 1e6),
+        pairing=section.pairing,
+    )
+
+
+def _camera_model(section: CameraSection, where: str) -> CameraModel | None:
+    if section.K is None:
+        return None
+    if section.width is None or section.height is None:
+        raise RigError(f"{where} has K but no width and height", hint="give the size of the images in px")
+    try:
+        return CameraModel(
+            model=section.model or ("plumb_bob" if section.D else "pinhole"),
+            K=np.array(section.K, dtype=np.float64),
+            D=np.array(section.D, dtype=np.float64),
+            width=section.width,
+            height=section.height,
+        )
+    except InputError as error:
+        raise RigError(f"{where}: {error.what}", hint=error.hint) from error
+
+
+def _rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
+    """A rigid motion; small rounding is taken out, anything else refused."""
+    if rows is None:
+        return None
+    T = np.array(rows, dtype=np.float64)
+    if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+        raise RigError(f"{where}: the last row is {T[3].tolist()}", hint="it must be [0, 0, 0, 1]")
+    R = T[:3, :3]
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > _ROUNDING:
+        raise RigError(
+            f"{where}: the rotation is not orthonormal (off by {error:.2g})",
+            hint=f"rows must be perpendicular unit vectors to {_ROUNDING:g}",
+        )
+    if np.linalg.det(R) < 0:
+        raise RigError(f"{where}: the rotation mirrors", hint="its determinant must be +1: check the axes")
+    T[:3, :3] = orthonormalised(R)
+    return T
+
+
+def _refusal(error: ValidationError, where: str) -> RigError:
+    """The first complaint of pydantic in our words."""
+    first = error.errors()[0]
+    location = first["loc"]
+    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
+    if first["type"] == "extra_forbidden":
+        owner: type[_Section] = RigDocument
+        for part in location[:-1]:
+            owner = _SECTIONS.get(str(part), owner)
+        return RigError(f"{where}: {path} is not a known key", hint=nearest(str(location[-1]), owner.model_fields))
+    if first["type"] == "literal_error":
+        return RigError(f"{where}: {path} is {first['input']!r}", hint=f"wanted {first['ctx']['expected']}")
+    return RigError(f"{where}: {path}: {first['msg']}", hint="see `calibwatch config schema`")
+
+
+def nearest(name: str, valid: Sequence[str] | Mapping[str, object]) -> str:
+    """A hint: the valid name that is nearest to ``name``, then all of them."""
+    close = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
+    known = f"known: {', '.join(valid)}"
+    return f"did you mean '{close[0]}'? {known}" if close else known
+
+
+def bind(rig: Rig, topics: Sequence[TopicInfo], *, where: str) -> Rig:
+    """The rig with every topic named, each of which is in the recording.
+
+    Raises:
+        InputError: A topic is not there (lists those that are), or "the only one" is none or several.
+    """
+    clouds = [topic.name for topic in topics if is_cloud(topic.type)]
+    images = [topic.name for topic in topics if is_image(topic.type)]
+    known = [topic.name for topic in topics]
+    pairs = []
+    for pair in rig.pairs:
+        lidar = pair.lidar.topic or _only(clouds, "point cloud", pair.name, where)
+        camera = pair.camera.topic or _only(images, "image", pair.name, where)
+        wanted = (lidar, camera, *([pair.camera.info] if pair.camera.info else []))
+        for topic in wanted:
+            if topic not in known:
+                raise InputError(f"{where} has no topic {topic} (pair {pair.name})", hint=nearest(topic, known))
+        pairs.append(
+            dataclasses.replace(
+                pair,
+                lidar=dataclasses.replace(pair.lidar, topic=lidar),
+                camera=dataclasses.replace(pair.camera, topic=camera),
+            )
+        )
+    return dataclasses.replace(rig, pairs=tuple(pairs))
+
+
+def _only(names: Sequence[str], kind: str, pair: str, where: str) -> str:
+    if len(names) != 1:
+        listed = f": {', '.join(names)}" if names else ""
+        raise InputError(
+            f"{where} has {len(names)} {kind} topics, and pair {pair} does not say which{listed}",
+            hint="name lidar.topic and camera.topic in a rig file",
+        )
+    return names[0]
+
+
+def is_cloud(type_name: str) -> bool:
+    """Whether messages of this type carry a sweep."""
+    return type_name in CLOUD_TYPES or type_name.removeprefix("file/") in CLOUD_SUFFIXES
+
+
+def is_image(type_name: str) -> bool:
+    """Whether messages of this type carry an image."""
+    return type_name in IMAGE_TYPES or type_name.removeprefix("file/") in IMAGE_SUFFIXES
+
+
+def camera_from_info(info: CameraInfo, *, rectified: bool | None, topic: str) -> tuple[CameraModel, str]:
+    """Which reading of a CameraInfo holds for the images of ``topic``, and why in one clause.
+
+    ``rectified`` of the rig wins. Else a topic whose last chunks say "rect" holds rectified images: P. Else K and D:
+    where D is zero and P has the same K both readings agree (KITTI: the images were rectified before they were
+    recorded, K is that of P). The fourth column of P and the rotation R are never used: they lead from one camera of
+    a stereo rig to another, which the extrinsic already states.
+
+    Raises:
+        RigError: The rig says rectified but the message has no P.
+    """
+    said = rectified is not None
+    by_name = any("rect" in chunk and "unrect" not in chunk for chunk in topic.split("/"))
+    if rectified if said else (by_name and info.rectified is not None):
+        if info.rectified is None:
+            raise RigError(
+                f"topic {topic} is said to be rectified, but its CameraInfo has no P",
+                hint="set camera.rectified = false, or give K, width and height in the rig file",
+            )
+        return info.rectified, "P: the rig says rectified" if said else "P: the topic's name says rectified"
+    if said:
+        return info.raw, "K and D: the rig says not rectified"
+    if not info.raw.D.any() and info.rectified is not None and np.allclose(info.raw.K, info.rectified.K):
+        return info.raw, "K without distortion: D is zero and P holds the same K"
+    return info.raw, "K and D: nothing says that the images are rectified"
+
+
+def parse_inject(text: str) -> Floats:
+    """``yaw=0.5,up=0.05`` (degrees, metres) as drift (6,): roll, pitch, yaw rad, forward, left, up m.
+
+    Raises:
+        RigError: An axis is unknown or given twice, or a value is no finite number.
+    """
+    drift = np.zeros(6)
+    seen = set()
+    for item in text.split(","):
+        name, _, number = (part.strip() for part in item.partition("="))
+        if name not in AXES:
+            raise RigError(f"--inject knows no axis '{name}'", hint=nearest(name, AXES))
+        if name in seen:
+            raise RigError(f"--inject names {name} twice", hint="give each axis once")
+        seen.add(name)
+        try:
+            value = float(number)
+        except ValueError as error:
+            raise RigError(f"--inject: '{number}' is no number for {name}", hint="as in yaw=0.5,up=0.05") from error
+        if not math.isfinite(value):
+            raise RigError(f"--inject: {name} is {number}", hint="a finite number, as in yaw=0.5,up=0.05")
+        index = AXES.index(name)
+        drift[index] = math.radians(value) if index < 3 else value
+    return drift
+
+
+def inject(pair: RigPair, drift: Floats) -> RigPair:
+    """The pair with its stored extrinsic altered so that the true drift is ``drift`` (6,), rad and m (DESIGN 2).
+
+    Raises:
+        RigError: The pair has no extrinsic yet.
+    """
+    if pair.T_cam_lidar is None:
+        raise RigError(f"pair {pair.name} has no extrinsic to alter", hint="give one in the rig file or by tf_static")
+    R_vehicle_lidar = None if pair.T_vehicle_lidar is None else pair.T_vehicle_lidar[:3, :3]
+    try:
+        stored = stored_before(pair.T_cam_lidar, drift, R_vehicle_lidar)
+    except CalibwatchError as error:
+        raise RigError(f"--inject: {error.what}", hint=error.hint) from error
+    return dataclasses.replace(pair, T_cam_lidar=stored)

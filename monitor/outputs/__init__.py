@@ -137,7 +137,7 @@ def open_outputs(names: Iterable[str], surroundings: Surroundings) -> Outputs:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Writes beside the final name, to the disk, and renames: a reader finds the old file or the new, whole."""
+    """Writes beside the final name, to the disk, and renames: a reader finds the old or the new, whole."""
     beside = path.with_name(path.name + PARTIAL)
     try:
         with beside.open("wb") as file:

@@ -1,6 +1,6 @@
 """``status.jsonl``: every status, one line of JSON each, in the order in which they came.
 
-It grows as ``status.jsonl.partial`` and gets its name when a complete run has ended: a run that was interrupted
+It grows as ``status.jsonl.partial`` and gets its name when a complete run has ended: one that was interrupted
 or killed leaves the partial name, every line in it whole.
 """
 

@@ -1,4 +1,4 @@
-"""What the evidence can see: directions in units of the alert limits, vehicle axes (FORMULAS A4, D3; DESIGN 4)."""
+"""What the evidence can see: directions in units of the alert limits (FORMULAS A4, D3; DESIGN 4)."""
 
 from dataclasses import dataclass
 
@@ -41,9 +41,10 @@ class Observability:
     Attributes:
         limits: float64 (6,), alert limits per axis, rad and m.
         sigmas: float64 (6,), standard deviation along each direction in alert limits, inf where null.
-        directions: float64 (6,6), columns are unit vectors in alert limits, axes in the order of records.AXES.
+        directions: float64 (6,6), columns are unit vectors in alert limits, in the order of records.AXES.
         observed: bool (6,), directions whose sigma is at most ``MAX_SIGMA``; the others are held.
-        axis_sigmas: float64 (6,), standard deviation of each axis, rad and m, inf where a null direction touches it.
+        axis_sigmas: float64 (6,), standard deviation of each axis, rad and m; inf where a null direction
+            touches it.
         axis_observed: bool (6,), axes whose own sigma is at most ``MAX_SIGMA`` alert limits.
     """
 
@@ -60,7 +61,7 @@ class Observability:
         return int(np.isfinite(self.sigmas).sum())
 
     def restrict(self, drift: Floats) -> Floats:
-        """The part of a drift (6,) that lies in the observed directions; held components become 0 (FORMULAS D3)."""
+        """The part of a drift (6,) in the observed directions; held components become 0 (FORMULAS D3)."""
         V = self.directions[:, self.observed]
         return np.asarray(self.limits * (V @ (V.T @ (drift / self.limits))))
 

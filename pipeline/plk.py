@@ -1,8 +1,8 @@
-"""Extrinsics from matched 3-D and image lines: PLK-Calib methods I and II with corrected equations (FORMULAS C, D).
+"""Extrinsics from matched 3-D and image lines: PLK-Calib methods I and II, corrected (FORMULAS C, D).
 
-Method I minimises the distances of the image lines' ends from the projected cloud lines over all six degrees of
-freedom; it is the maximum-likelihood answer. Method II finds the rotation from directions and the translation
-linearly after it; it needs no good start and serves as one.
+Method I minimises the distances of the image lines' ends from the projected cloud lines over all six degrees
+of freedom; it is the maximum-likelihood answer. Method II finds the rotation from directions and the
+translation linearly after it; it needs no good start and serves as one.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from pipeline import se3
 from pipeline.records import Floats
 
 HUBER = 2.5
-"""Whitened end-point distance beyond which a line's weight falls: 96 % of good lines (Rayleigh) keep weight 1."""
+"""Whitened distance of a line beyond which its weight falls: 96 % of good lines (Rayleigh) keep weight 1."""
 
 STEP_SCALE = np.array([0.01] * 3 + [0.1] * 3)
 """rad and m; makes the steps of the solvers comparable: 1 cm of sight at 1 m, 10 cm at 10 m."""
@@ -25,6 +25,9 @@ _CONVERGED = 1e-13
 
 _MIN_DAMPING = 1e-10
 """Relative to the largest curvature: keeps null directions where they are, slows no observed one."""
+
+_MAX_DAMPING = 1e6
+"""Likewise: a step so small that does not lower the cost is rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +74,7 @@ class Solution:
         information: float64 (6,6), of (phi, rho) at the solution, from the lines alone (FORMULAS D2).
         gradient: float64 (6,), of the lines alone at the solution, -sum J^T S^-1 r; zero without a prior.
         distances: float64 (N,), whitened distance of each line.
-        chi2: Squared whitened distances, Huber weighted, per degree of freedom; 1 where there is none to spare.
+        chi2: Squared whitened distances, Huber weighted, per degree of freedom; 1 where none is to spare.
     """
 
     T_cam_lidar: Floats
@@ -98,7 +101,7 @@ def line_matrix(K: Floats) -> Floats:
 
 
 def plucker(start: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Moments and unit directions (N,3) of the lines through two points (N,3) each (PLK (1), both normalised)."""
+    """Moments and unit directions (N,3) of lines through points (N,3), (N,3) (PLK (1), both normalised)."""
     span = end - start
     length = np.linalg.norm(span, axis=1, keepdims=True)
     return np.cross(start, end) / length, span / length
@@ -113,7 +116,7 @@ def _in_camera(pairs: LinePairs, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
 
 
 def residuals(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
-    """Signed distances (N,2), px, of both image ends from the projected line (PLK (4), second end corrected)."""
+    """Distances (N,2), px, signed, of both image ends from the projected line (PLK (4), corrected)."""
     n_cam, _ = _in_camera(pairs, T_cam_lidar)
     line = n_cam @ line_matrix(K).T
     norm = np.hypot(line[:, 0], line[:, 1])
@@ -121,7 +124,7 @@ def residuals(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
 
 
 def jacobians(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
-    """d residual / d (phi, rho), (N,2,6): PLK (6) with the signs of the left perturbation (FORMULAS C (6))."""
+    """Derivative (N,2,6) of the residuals by (phi, rho): PLK (6), signs of the left perturbation."""
     n_cam, v_cam = _in_camera(pairs, T_cam_lidar)
     K_line = line_matrix(K)
     line = n_cam @ K_line.T
@@ -147,7 +150,7 @@ def _homogeneous(uv: Floats) -> Floats:
 
 
 def plane_normals(pairs: LinePairs, K: Floats) -> Floats:
-    """Unit normals (N,3), camera frame, of the planes through the camera and the image lines (PLK (7), n' = K^T l')."""
+    """Unit normals (N,3), camera frame, of the planes through camera and image lines: K^T l' (PLK (7))."""
     line = np.cross(_homogeneous(pairs.image_start), _homogeneous(pairs.image_end))
     normal = line @ K
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
@@ -156,8 +159,8 @@ def plane_normals(pairs: LinePairs, K: Floats) -> Floats:
 def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
     """PLK-Calib method II: rotation from directions, then translation linearly (FORMULAS C (10)-(14), C7).
 
-    Stage 1 minimises the weighted sines ``n'^T R v``; stage 2 solves ``n'.t = -n'.(R p_m)``, the scalar form, since
-    the printed matrix form is biased.
+    Stage 1 minimises the weighted sines ``n'^T R v``; stage 2 solves ``n'.t = -n'.(R p_m)``, the scalar form,
+    since the printed matrix form is biased.
 
     Args:
         pairs: At least three lines.
@@ -197,7 +200,7 @@ def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
 
 
 def _stage_sigmas(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
-    """Standard deviations (N,) of the two stages' residuals: sine (FORMULAS C7) and offset in metres (C (14))."""
+    """Sigmas (N,) of the two stages' residuals: sine (FORMULAS C7) and offset in metres (C (14))."""
     n_cam, _ = _in_camera(pairs, T_cam_lidar)
     kappa = line_sensitivity(n_cam, K)
     R, t = T_cam_lidar[2, :3], T_cam_lidar[2, 3]
@@ -209,7 +212,7 @@ def _stage_sigmas(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> tuple[Flo
 
 
 def line_sensitivity(n_cam: Floats, K: Floats) -> Floats:
-    """kappa (N,), px: a 3-D point moved by d across the line at depth z moves the image line by kappa d / z (D1)."""
+    """Sensitivity kappa (N,), px: moving a point at depth z by d moves the line by kappa d / z (D1)."""
     line = n_cam @ line_matrix(K).T
     return np.asarray(
         np.linalg.det(K) * np.linalg.norm(n_cam, axis=1) / np.maximum(np.hypot(line[:, 0], line[:, 1]), 1e-12)
@@ -284,7 +287,7 @@ def method_one(
             damping = max(damping / 10, _MIN_DAMPING)
         else:
             damping *= 10
-        if np.abs(step).max() < _CONVERGED or damping > 1e6:
+        if np.abs(step).max() < _CONVERGED or damping > _MAX_DAMPING:
             break
     T = se3.transform(se3.orthonormalised(T[:3, :3]), T[:3, 3])
     lines = at[0]

@@ -1,0 +1,394 @@
+"""The second witness: how well the edges of the cloud lie on gradients of the image (PROBE sections 1, 4, 5).
+
+The score of an extrinsic is the weighted mean gradient response under all projected edges of a window of frames. The
+estimate is its maximum near the stored extrinsic; its covariance is the sandwich H^-1 G H^-1, where everything that
+falls into one cell of the image over the whole window counts as ONE observation: the same car is one witness.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import cameras, se3
+from pipeline.edges import CELL_COLUMNS, CELL_ROWS, Edges
+from pipeline.gradients import GradientPyramid, sample
+from pipeline.records import CameraModel, Floats
+
+UNITS = np.array([math.radians(0.25)] * 3 + [0.05] * 3)
+"""Alert units in which steps are measured (0.25 deg, 5 cm): a unit of each matters about as much to perception."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeWitnessParameters:
+    """How the maximum is sought and how sure it is.
+
+    Attributes:
+        step_limits: Longest step at each level of the pyramid, alert units: what the blur of that level can bridge.
+        most_steps: Steps per level.
+        least_step: Search ends when a step is shorter, alert units: 0.003 deg, a tenth of the smallest sigma seen.
+        difference: Step of the differences that give the Hessian, alert units.
+        eigenvalue_floor: Smallest eigenvalue of the Hessian as a share of the largest.
+        sigma_factor: Scatter of window estimates over their stated sigma on four measured drives (PROBE 4): k.
+        least_gain: A maximum reached over a coarser level must score so much more to be preferred, share: coarse
+            levels lead into false modes, which score up to 3 % more; real drifts gain over 12 %.
+        farthest_rad: A maximum further from the stored extrinsic is not believed.
+        farthest_m: Likewise.
+        contrast_starts: Random extrinsics that tell the score of chance.
+        contrast_rad: Their rotation: least and most.
+        contrast_m: Their shift.
+    """
+
+    step_limits: tuple[float, float, float] = (0.3, 0.6, 1.0)
+    most_steps: int = 40
+    least_step: float = 0.01
+    difference: float = 0.3
+    eigenvalue_floor: float = 0.01
+    sigma_factor: float = 2.0
+    least_gain: float = 0.02
+    farthest_rad: float = math.radians(5.0)
+    farthest_m: float = 1.0
+    contrast_starts: int = 24
+    contrast_rad: tuple[float, float] = (math.radians(3.0), math.radians(6.0))
+    contrast_m: float = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeFrame:
+    """What the edge witness keeps of one frame.
+
+    Attributes:
+        stamp_ns: Stamp of the image.
+        edges: Edges of the cloud.
+        gradients: Gradients of the image.
+    """
+
+    stamp_ns: int
+    edges: Edges
+    gradients: GradientPyramid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeBatch:
+    """Edges of several frames in one set of arrays; ``slot`` says which frame each belongs to."""
+
+    position: Floats
+    direction: Floats
+    weight: Floats
+    cell: NDArray[np.int64]
+    slot: NDArray[np.int64]
+    stacks: tuple[NDArray[np.uint16], ...]
+    scales: tuple[tuple[float, float], ...]
+    camera: CameraModel
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+
+def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel) -> EdgeBatch:
+    """Joins frames of one camera. At least one frame."""
+    return EdgeBatch(
+        position=np.concatenate([f.edges.position for f in frames]),
+        direction=np.concatenate([f.edges.direction for f in frames]),
+        weight=np.concatenate([f.edges.weight for f in frames]),
+        cell=np.concatenate([f.edges.cell for f in frames]),
+        slot=np.repeat(np.arange(len(frames)), [len(f.edges) for f in frames]),
+        stacks=tuple(
+            np.stack([f.gradients.levels[level] for f in frames])
+            for level in range(len(frames[0].gradients.levels))
+        ),
+        scales=frames[0].gradients.scales,
+        camera=camera,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeSolution:
+    """The maximum of the score over a window.
+
+    Attributes:
+        xi: float64 (6,), against the stored extrinsic, camera axes.
+        covariance: float64 (6,6) of xi: the sandwich times sigma_factor^2.
+        score: Score at the maximum.
+        score_stored: Score at the stored extrinsic.
+        contrast: Score at the stored extrinsic over that of chance, minus 1.
+        loss: Share of the best score that is lost if the stored extrinsic may move inside the floor only (G of
+            PROBE 5).
+        block_gains: For each third of the window in time, its own score at the maximum over that at the best point
+            inside the floor, minus 1.
+        edges: Number of edges.
+        frames: Number of frames.
+    """
+
+    xi: Floats
+    covariance: Floats
+    score: float
+    score_stored: float
+    contrast: float
+    loss: float
+    block_gains: tuple[float, ...]
+    edges: int
+    frames: int
+
+
+def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Floats, Floats]:
+    """Score of an extrinsic, its gradient by xi, and each edge's share of that gradient.
+
+    Returns:
+        Score (weighted mean response), gradient float64 (6,) by (phi, rho) at ``T_cam_lidar``, and float64 (N,6)
+        whose sum is the gradient. The direction across each edge is held while differentiating.
+    """
+    value, point_slope, points = _respond(batch, T_cam_lidar, level)
+    total = float(batch.weight.sum())
+    w = (batch.weight / total)[:, None]
+    share = np.concatenate([np.cross(points, point_slope), point_slope], axis=1) * w
+    return float(batch.weight @ value) / total, share.sum(axis=0), share
+
+
+def _respond(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[Floats, Floats, Floats]:
+    """Response (N,) under each edge, its derivative (N,3) by the point, and the points (N,3), camera frame."""
+    R = T_cam_lidar[:3, :3]
+    points = batch.position @ R.T + T_cam_lidar[:3, 3]
+    uv, valid = cameras.project_unbounded(batch.camera, points)
+    seen = np.where(valid[:, None], points, [0.0, 0.0, 1.0])
+    J = cameras.projection_jacobian(batch.camera, seen)
+    step = np.einsum("nij,nj->ni", J, batch.direction @ R.T)
+    angle = np.arctan2(step[:, 1], step[:, 0])
+    value, slope = sample(
+        batch.stacks[level], batch.slot, np.where(valid[:, None], uv, 0.0), angle, batch.scales[level]
+    )
+    value = np.where(valid, value, 0.0)
+    slope = np.where(valid[:, None], slope, 0.0)
+    return value, np.einsum("ni,nij->nj", slope, J), points
+
+
+def score_only(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> Floats:
+    """Weighted response of each edge, (N,); its sum over the sum of the weights is the score."""
+    return batch.weight * _respond(batch, T_cam_lidar, level)[0]
+
+
+def solve(
+    batch: EdgeBatch,
+    T_stored: Floats,
+    floor: Floats,
+    parameters: EdgeWitnessParameters,
+    rng: np.random.Generator,
+) -> EdgeSolution:
+    """Estimate over a window, with what a verdict needs beside it.
+
+    Args:
+        batch: Edges and gradients of the window's frames.
+        T_stored: The stored extrinsic.
+        floor: float64 (6,6), covariance of xi that is no drift: systematic floor and the stored extrinsic's own
+            uncertainty, camera axes.
+        parameters: See there.
+        rng: Draws the extrinsics of chance.
+    """
+    stored = score(batch, T_stored, 0)[0]
+    xi, best = _best_maximum(batch, T_stored, stored, parameters)
+    T_best = se3.retract(T_stored, xi)
+    inside = _best_inside(batch, T_stored, best, floor, parameters)
+    at_best = score_only(batch, T_best, 0)
+    at_inside = score_only(batch, se3.retract(T_stored, inside), 0)
+    penalty = _PENALTY * float(inside @ np.linalg.solve(floor, inside))
+    return EdgeSolution(
+        xi=xi,
+        covariance=_covariance(batch, T_best, parameters),
+        score=best,
+        score_stored=stored,
+        contrast=_contrast(batch, T_stored, stored, parameters, rng),
+        loss=max(0.0, 1.0 - float(at_inside.sum() / at_best.sum()) + penalty) if best > 0 else 0.0,
+        block_gains=_block_gains(batch.slot, at_best, at_inside),
+        edges=len(batch),
+        frames=len(batch.stacks[0]),
+    )
+
+
+_BLOCKS = 3
+"""Parts of the window that must each prefer the new extrinsic: one passing truck is not three witnesses."""
+
+
+def _block_gains(slot: NDArray[np.int64], at_best: Floats, at_inside: Floats) -> tuple[float, ...]:
+    frames = int(slot.max()) + 1
+    block = np.minimum(slot * _BLOCKS // max(frames, _BLOCKS), _BLOCKS - 1)
+    best = np.bincount(block, at_best, minlength=_BLOCKS)
+    inside = np.bincount(block, at_inside, minlength=_BLOCKS)
+    return tuple(
+        float(b / i - 1.0) if i > 0 else 0.0 for b, i in zip(best, inside, strict=True) if b > 0 or i > 0
+    )
+
+
+def _best_maximum(
+    batch: EdgeBatch, T_stored: Floats, stored: float, parameters: EdgeWitnessParameters
+) -> tuple[Floats, float]:
+    """The nearest maximum, unless one that a coarser level leads to scores clearly more."""
+    xi, best = np.zeros(6), stored
+    for schedule in ((0,), (1, 0), (2, 1, 0)):
+        candidate = np.zeros(6)
+        for level in schedule:
+            candidate = _ascend(batch, T_stored, candidate, level, parameters)
+        value = score(batch, se3.retract(T_stored, candidate), 0)[0]
+        far = np.linalg.norm(candidate[:3]) > parameters.farthest_rad
+        far = far or float(np.linalg.norm(candidate[3:])) > parameters.farthest_m
+        wanted = best if schedule == (0,) else best * (1.0 + parameters.least_gain)
+        if value > wanted and not far:
+            xi, best = candidate, value
+    return xi, best
+
+
+def _ascend(
+    batch: EdgeBatch, T_stored: Floats, xi: Floats, level: int, parameters: EdgeWitnessParameters
+) -> Floats:
+    """Climbs from ``xi`` at one level of the pyramid."""
+
+    def negative(x: Floats) -> tuple[float, Floats, Floats]:
+        s, _, share = score(batch, se3.retract(T_stored, x * UNITS), level)
+        # Gradient by xi at a point away from the reference: retraction composes to first order (A2).
+        return -s, -share.sum(axis=0) * UNITS, share * UNITS
+
+    start_value, start_gradient, share = negative(xi / UNITS)
+    curvature = _start_curvature(share, batch.weight, -start_value)
+    x = _descend(
+        lambda y: negative(y)[:2],
+        xi / UNITS,
+        (start_value, start_gradient),
+        curvature,
+        parameters.step_limits[level],
+        parameters,
+    )
+    return np.asarray(x * UNITS, dtype=np.float64)
+
+
+def _start_curvature(share: Floats, weight: Floats, value: float) -> Floats:
+    """First guess of the curvature from the outer product of the edges' gradients (PROBE 1): 4/s sum w g g^T / sum w."""
+    total = float(weight.sum())
+    per_edge = share * (total / np.maximum(weight, 1e-12))[:, None]
+    outer = (per_edge * (weight / total)[:, None]).T @ per_edge
+    return np.asarray(4.0 / max(value, 1e-6) * outer + 1e-6 * np.eye(6), dtype=np.float64)
+
+
+def _descend(
+    function: Callable[[Floats], tuple[float, Floats]],
+    x: Floats,
+    start: tuple[float, Floats],
+    B: Floats,
+    radius: float,
+    parameters: EdgeWitnessParameters,
+) -> Floats:
+    """Minimises by trust-region BFGS in alert units: steps stay inside the basin that the blur makes."""
+    value, gradient = start
+    limit = radius
+    for _ in range(parameters.most_steps):
+        step = _trust_region_step(B, gradient, radius)
+        length = float(np.linalg.norm(step))
+        if length < parameters.least_step:
+            break
+        new_value, new_gradient = function(x + step)
+        predicted = -float(gradient @ step + 0.5 * step @ B @ step)
+        ratio = (value - new_value) / predicted if predicted > 0 else -1.0
+        change = new_gradient - gradient
+        curvature = float(step @ change)
+        if curvature > 1e-8 * length * float(np.linalg.norm(change)):
+            Bs = B @ step
+            B = B - np.outer(Bs, Bs) / float(step @ Bs) + np.outer(change, change) / curvature
+        if ratio > _ACCEPT:
+            x, value, gradient = x + step, new_value, new_gradient
+        radius = 0.5 * length if ratio < _SHRINK else min(limit, max(radius, 2.0 * length))
+    return x
+
+
+_ACCEPT, _SHRINK = 1e-4, 0.25
+"""Shares of the predicted decrease: below the first a step is not taken, below the second the next is shorter."""
+
+
+def _trust_region_step(B: Floats, gradient: Floats, radius: float) -> Floats:
+    """The minimum of the quadratic model within ``radius``, by the eigenvalues of the 6x6 curvature."""
+    values, vectors = np.linalg.eigh(B)
+    g = vectors.T @ gradient
+    values = np.maximum(values, 1e-9)
+    step = -g / values
+    if np.linalg.norm(step) <= radius:
+        return np.asarray(vectors @ step, dtype=np.float64)
+    low, high = 0.0, float(np.linalg.norm(g)) / radius
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if np.linalg.norm(g / (values + middle)) > radius:
+            low = middle
+        else:
+            high = middle
+    return np.asarray(vectors @ (-g / (values + high)), dtype=np.float64)
+
+
+_PENALTY = 0.004
+"""Score that one sigma^2 inside the floor costs, as a share of the best score (PROBE 5)."""
+
+
+def _best_inside(
+    batch: EdgeBatch, T_stored: Floats, best: float, floor: Floats, parameters: EdgeWitnessParameters
+) -> Floats:
+    """The best xi when leaving the stored extrinsic costs by the floor: what may be explained without a drift."""
+    inverse = np.linalg.inv(floor)
+    scale = 1.0 / max(best, 1e-9)
+
+    def cost(x: Floats) -> tuple[float, Floats]:
+        xi = x * UNITS
+        s, gradient, _ = score(batch, se3.retract(T_stored, xi), 0)
+        pull = inverse @ xi
+        return (
+            -s * scale + _PENALTY * float(xi @ pull),
+            (-gradient * scale + 2.0 * _PENALTY * pull) * UNITS,
+        )
+
+    x0 = np.zeros(6)
+    _, _, share = score(batch, T_stored, 0)
+    B = _start_curvature(share * UNITS, batch.weight, best) * scale
+    B = B + 2.0 * _PENALTY * (UNITS[:, None] * inverse * UNITS[None, :])
+    found = _descend(cost, x0, cost(x0), B, parameters.step_limits[0], parameters)
+    return np.asarray(found * UNITS, dtype=np.float64)
+
+
+def _covariance(batch: EdgeBatch, T: Floats, parameters: EdgeWitnessParameters) -> Floats:
+    """H^-1 G H^-1 with G summed over image cells across all frames (PROBE 4 c), times sigma_factor^2."""
+    H = np.zeros((6, 6))
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = parameters.difference
+        ahead = score(batch, se3.retract(T, step * UNITS), 0)[1] * UNITS
+        behind = score(batch, se3.retract(T, -step * UNITS), 0)[1] * UNITS
+        H[axis] = -(ahead - behind) / (2.0 * parameters.difference)
+    values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+    values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
+    H_inverse = (vectors / values) @ vectors.T
+    share = score(batch, T, 0)[2] * UNITS
+    cells = np.zeros((CELL_COLUMNS * CELL_ROWS, 6))
+    np.add.at(cells, batch.cell, share)
+    G = cells.T @ cells
+    C = H_inverse @ G @ H_inverse * parameters.sigma_factor**2
+    # A direction that no cell pulls on has no stated error; the floor of H alone bounds it.
+    C = C + 1e-8 * np.eye(6)
+    return np.asarray(UNITS[:, None] * C * UNITS[None, :], dtype=np.float64)
+
+
+def _contrast(
+    batch: EdgeBatch,
+    T_stored: Floats,
+    stored: float,
+    parameters: EdgeWitnessParameters,
+    rng: np.random.Generator,
+) -> float:
+    """Score at the stored extrinsic over the mean at far random ones, minus 1."""
+    chance = []
+    for _ in range(parameters.contrast_starts):
+        axis, shift = rng.normal(size=3), rng.normal(size=3)
+        angle = rng.uniform(*parameters.contrast_rad)
+        xi = np.concatenate(
+            [
+                axis / np.linalg.norm(axis) * angle,
+                shift / np.linalg.norm(shift) * parameters.contrast_m,
+            ]
+        )
+        chance.append(float(score_only(batch, se3.retract(T_stored, xi), 0).sum()))
+    mean = float(np.mean(chance)) / float(batch.weight.sum())
+    return stored / mean - 1.0 if mean > 0 else 0.0

@@ -167,7 +167,7 @@ def _stage(inputs: int, outputs: int, *, layers: int, expansion: int) -> nn.Modu
 
 
 class Aggregation(nn.Module):
-    """Bilateral guided aggregation: each branch gates the other at its own scale; the sum comes out at 1/8."""
+    """Bilateral guided aggregation: each branch gates the other at its own scale, summed at 1/8."""
 
     def __init__(self, detail: int, semantic: int, fused: int) -> None:
         super().__init__()

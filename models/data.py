@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 
 from models import augment
-from models.losses import group_table
 from pipeline import labels
 
 if TYPE_CHECKING:
@@ -31,6 +30,28 @@ CACHE_BYTES = 2 << 30
 """Decoded pictures kept in memory; more are decoded again at each use."""
 
 
+def group_table(folded_into: dict[int, list[int]] | None = None) -> NDArray[np.bool_]:
+    """Return what each label value may be: bool (classes, classes), row = value, column = class.
+
+    Args:
+        folded_into: Label value -> all classes that its pixels may be; values not named mean themselves.
+
+    Raises:
+        ValueError: If a value or class is not in the label contract, or a group leaves out its own value.
+    """
+    table = np.eye(len(labels.NAMES), dtype=np.bool_)
+    for value, group in (folded_into or {}).items():
+        if (
+            not 0 <= value < len(labels.NAMES)
+            or not all(0 <= c < len(labels.NAMES) for c in group)
+            or value not in group
+        ):
+            raise ValueError(f"group {value} -> {group} does not fit the {len(labels.NAMES)} classes")
+        table[value] = False
+        table[value, group] = True
+    return table
+
+
 class DataError(Exception):
     """A training folder that does not keep the layout; the text names the file."""
 
@@ -41,7 +62,7 @@ class LabelledSet:
 
     Args:
         folder: Where it lies.
-        groups: What a label value may be, bool (classes, classes), see ``losses.group_table``.
+        groups: What a label value may be, bool (classes, classes), see ``group_table``.
         labelled: The classes that were drawn.
         splits: Split name -> picture ids.
     """

@@ -2,41 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
 import torch
 
 from pipeline import labels
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 CLASS_WEIGHTS = (1.0, 3.0, 5.0, 1.0, 1.0, 1.0, 1.0, 1.0, 2.0)
 """Weight of a pixel by its label value. Paint and poles cover 1 to 2 % of a road picture: without weight the
 cheapest answer is to deny them. More weight over-paints: the probabilities then say more than was seen."""
 
-_CLASSES = len(labels.NAMES)
 _FLOOR = 1e-30
 """Smallest probability that still has a gradient: logits 69 apart, and its inverse is finite in float32."""
-
-
-def group_table(folded_into: dict[int, list[int]] | None = None) -> NDArray[np.bool_]:
-    """Return what each label value may be: bool (classes, classes), row = value, column = class.
-
-    Args:
-        folded_into: Label value -> all classes that its pixels may be; values not named mean themselves.
-
-    Raises:
-        ValueError: If a value or class is not in the label contract, or a group leaves out its own value.
-    """
-    table = np.eye(_CLASSES, dtype=np.bool_)
-    for value, group in (folded_into or {}).items():
-        if not 0 <= value < _CLASSES or not all(0 <= c < _CLASSES for c in group) or value not in group:
-            raise ValueError(f"group {value} -> {group} does not fit the {_CLASSES} classes")
-        table[value] = False
-        table[value, group] = True
-    return table
 
 
 def grouped_nll(
@@ -50,7 +25,7 @@ def grouped_nll(
     Args:
         logits: (B, classes, h, w).
         target: Label values, integer (B, f*h, f*w) with a whole number f; ``labels.IGNORE`` takes no part.
-        groups: What a value may be, bool (B, classes, classes), see ``group_table``.
+        groups: What a value may be, bool (B, classes, classes), see ``data.group_table``.
         weights: Weight of a pixel by its label value, (classes,).
     """
     batch, _, height, width = logits.shape

@@ -12,6 +12,7 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,6 +21,9 @@ import torch
 from models import losses
 from models.bisenetv2 import BiSeNetV2
 from models.data import Sampler, fingerprint, read_sets
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -117,17 +121,28 @@ def update_average(average: torch.nn.Module, network: torch.nn.Module, decay: fl
 
 
 def train(
-    run: Run, sampler: Sampler, recipe: Recipe, *, minutes: float, out: Path, data: str, seed: int
+    run: Run,
+    sampler: Sampler,
+    recipe: Recipe,
+    *,
+    minutes: float,
+    out: Path,
+    data: str,
+    seed: int,
+    clock: Callable[[], float],
 ) -> None:
-    """Train until ``minutes`` are spent in all, over every call; the checkpoint goes to ``out``."""
+    """Train until ``minutes`` are spent in all, over every call; the checkpoint goes to ``out``.
+
+    ``clock`` gives seconds that never go back; ``data`` is the fingerprint of the training data.
+    """
     device = next(run.network.parameters()).device
     half_precision = device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()  # noqa: SLF001 no public name
     weights = torch.tensor(losses.CLASS_WEIGHTS, device=device)
     rng = np.random.default_rng((seed, run.step))
     run.network.train()
-    began = saved = time.monotonic()
+    began = saved = clock()
     before = run.spent_s
-    mean_loss = 0.0
+    losses_seen: list[float] = []
     while run.spent_s < 60.0 * minutes:
         rate = learning_rate(recipe, run.step, run.spent_s / (60.0 * minutes))
         for group in run.optimiser.param_groups:
@@ -148,13 +163,14 @@ def train(
         torch.nn.utils.clip_grad_norm_(run.network.parameters(), recipe.clip)
         run.optimiser.step()
         update_average(run.average, run.network, recipe.average, run.step)
-        mean_loss += (float(loss.detach()) - mean_loss) / (run.step % 50 + 1)
+        losses_seen.append(float(loss.detach()))
         run.step += 1
-        now = time.monotonic()
+        now = clock()
         run.spent_s = before + now - began
         if run.step % 50 == 0:
+            mean_loss = sum(losses_seen) / len(losses_seen)
             log.info("step %d, %.0f s, rate %.5f, loss %.4f", run.step, run.spent_s, rate, mean_loss)
-            mean_loss = 0.0
+            losses_seen.clear()
         if now - saved > recipe.save_s:
             run.save(out / CHECKPOINT, data)
             saved = now
@@ -202,6 +218,7 @@ def main() -> None:
         out=options.out,
         data=fingerprint(sets),
         seed=options.seed,
+        clock=time.monotonic,
     )
 
 

@@ -1,0 +1,95 @@
+"""Write a checkpoint as one ONNX file with its contract: ``python -m models.export --checkpoint F --out F``.
+
+The file takes RGB float32 0..255 (1, 3, H, W), H and W multiples of 32, and gives class probabilities float32
+(1, classes, H/2, W/2). Its metadata names classes, label contract, input size rule, normalisation, model
+version and the hash of the training data; the run time refuses a file that says something else than it does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import onnx
+import torch
+
+from models.bisenetv2 import GRID, STRIDE, BiSeNetV2
+from pipeline import labels
+
+INPUT_RULE = (
+    f"longer side at most 1280 px by area means; "
+    f"right and bottom edge repeated to multiples of {STRIDE}; grid 1/{GRID}"
+)
+"""How a picture becomes an input. Changes together with ``pipeline.segmentation.INPUT_RULE``."""
+
+NORMALISATION = "rgb 0..255, centred and scaled in the graph"
+"""What the pixel values are. Changes together with ``pipeline.segmentation.NORMALISATION``."""
+
+
+class Probabilities(torch.nn.Module):
+    """The network with the softmax over its head, as the run time wants it."""
+
+    def __init__(self, network: BiSeNetV2) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Map (1, 3, H, W) to probabilities (1, classes, H/2, W/2)."""
+        logits, _ = self.network(rgb)
+        return torch.softmax(logits, dim=1)
+
+
+def to_onnx(network: BiSeNetV2, out: Path, *, version: str, data_sha256: str) -> None:
+    """Export the network in evaluation mode as a single file, written beside its name and renamed when whole.
+
+    Args:
+        network: With the weights to ship.
+        out: The ``.onnx`` file.
+        version: Name of these weights.
+        data_sha256: ``data.fingerprint`` of what they were trained on.
+    """
+    model = Probabilities(network.to("cpu", memory_format=torch.contiguous_format)).eval()
+    example = torch.zeros(1, 3, 2 * STRIDE, 4 * STRIDE)
+    height, width = torch.export.Dim("rows", min=1, max=256), torch.export.Dim("columns", min=1, max=256)
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        unfinished = Path(folder) / out.name
+        torch.onnx.export(
+            model,
+            (example,),
+            unfinished,
+            input_names=["rgb"],
+            output_names=["probabilities"],
+            dynamo=True,
+            dynamic_shapes={"rgb": {2: STRIDE * height, 3: STRIDE * width}},
+            verbose=False,
+        )
+        graph = onnx.load(unfinished)
+        said = {
+            "class_names": ",".join(labels.NAMES),
+            "labels_version": labels.VERSION,
+            "input_rule": INPUT_RULE,
+            "normalisation": NORMALISATION,
+            "model_version": version,
+            "training_data_sha256": data_sha256,
+        }
+        onnx.helper.set_model_props(graph, said)
+        onnx.save(graph, unfinished, save_as_external_data=False)
+        unfinished.replace(out)
+
+
+def main() -> None:
+    """Read the options and export the running mean of a checkpoint's weights."""
+    parser = argparse.ArgumentParser(prog="python -m models.export", description=__doc__)
+    parser.add_argument("--checkpoint", type=Path, required=True, help="checkpoint.pt of models.train")
+    parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
+    parser.add_argument("--version", required=True, help="name of these weights, for example 1.0")
+    options = parser.parse_args()
+    state = torch.load(options.checkpoint, map_location="cpu", weights_only=True)
+    network = BiSeNetV2()
+    network.load_state_dict(state["average"])
+    to_onnx(network, options.out, version=options.version, data_sha256=state["data_sha256"])
+
+
+if __name__ == "__main__":
+    main()

@@ -209,6 +209,7 @@ class CloudLine:
         points: int64 (m,), indices of its points in the cloud.
         sigma_m: Noise of one point across the line, metres per axis (sigma_p of FORMULAS D1).
         spread: Sum of squared distances of the points along the line from their mean, m^2 (S of FORMULAS D1).
+        mean_m: Distance of the points' mean from ``start`` along the line, metres; None for the middle.
     """
 
     label: LineLabel
@@ -217,6 +218,7 @@ class CloudLine:
     points: NDArray[np.int64]
     sigma_m: float
     spread: float
+    mean_m: float | None = None
 
     def __post_init__(self) -> None:
         _hold(self, "start", np.float64, (3,))

@@ -1,13 +1,14 @@
 """``summary.json``, ``calibwatch.summary/1``: what a run said, in one small file that a program reads."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field
 
 from monitor.events import EndEvent, Event, StatusEvent
 from monitor.outputs import OutputKind, folder_of, write_whole
-from monitor.status import Code, Frames, Name, State, Status, first_in_precedence
+from monitor.outputs._history import Change, History
+from monitor.status import Frames, Name, State, Status, first_in_precedence
 
 FILE_NAME = "summary.json"
 
@@ -16,15 +17,6 @@ SCHEMA: Literal["calibwatch.summary/1"] = "calibwatch.summary/1"
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True, serialize_by_alias=True)
-
-
-class Change(_Part):
-    """A state that was entered."""
-
-    state: State
-    code: Code
-    reason: Annotated[str, StringConstraints(min_length=1)]
-    stamp_ns: int
 
 
 class PairSummary(_Part):
@@ -56,8 +48,7 @@ class SummaryFile:
     def __init__(self, folder: Path, vehicle: str) -> None:
         self._path = folder / FILE_NAME
         self._vehicle = vehicle
-        self._last: dict[str, Status] = {}
-        self._timelines: dict[str, list[Change]] = {}
+        self._histories: dict[str, History] = {}
 
     @property
     def lost(self) -> str | None:
@@ -67,7 +58,8 @@ class SummaryFile:
     def handle(self, event: Event) -> None:
         """Takes note of a status; writes the file at the end, whether the run was complete or not."""
         if isinstance(event, StatusEvent):
-            self._note(event.status)
+            status = event.status
+            self._histories.setdefault(status.pair, History(status)).note(status)
         elif isinstance(event, EndEvent):
             write_whole(self._path, self.summary(event).model_dump_json(indent=2).encode() + b"\n")
 
@@ -78,12 +70,12 @@ class SummaryFile:
         """What has been said so far."""
         pairs = {
             pair: PairSummary(
-                state=status.state,
-                timeline=tuple(self._timelines[pair]),
-                frames=status.frames,
-                last=status,
+                state=history.last.state,
+                timeline=history.timeline,
+                frames=history.last.frames,
+                last=history.last,
             )
-            for pair, status in sorted(self._last.items())
+            for pair, history in sorted(self._histories.items())
         }
         return Summary(
             state=first_in_precedence(pair.state for pair in pairs.values()),
@@ -93,16 +85,6 @@ class SummaryFile:
             pairs=pairs,
             warnings=end.warnings,
         )
-
-    def _note(self, status: Status) -> None:
-        timeline = self._timelines.setdefault(status.pair, [])
-        last = self._last.get(status.pair)
-        if last is None or (last.state, last.code) != (status.state, status.code):
-            entered_ns = status.since_ns if last is None or last.state != status.state else status.stamp_ns
-            timeline.append(
-                Change(state=status.state, code=status.code, reason=status.reason, stamp_ns=entered_ns)
-            )
-        self._last[status.pair] = status
 
 
 OUTPUT = OutputKind(

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -89,8 +90,10 @@ def lane_corners(y: float) -> np.ndarray:
     )
 
 
-def seen(T: np.ndarray) -> tuple[CameraImage, Masks]:
-    """What the camera shows under extrinsic T, and its masks at half the size."""
+@cache
+def scene(*, moved: bool) -> tuple[CameraImage, Masks, tuple[LineMatch, ...]]:
+    """What the camera shows before and after its mount moved, masks at half the size, and matched poles."""
+    T = T_DRIFTED if moved else T_STORED
     pixels = np.full((CAMERA.height, CAMERA.width, 3), (200, 170, 140), dtype=np.uint8)
     pixels[150:] = (95, 95, 95)
     lane = np.zeros(pixels.shape[:2], dtype=np.uint8)
@@ -103,7 +106,7 @@ def seen(T: np.ndarray) -> tuple[CameraImage, Masks]:
         cv2.fillPoly(pole, [polygon(T, pole_corners(*found))], (1,), cv2.LINE_8, 4)
     lane, pole = lane[::2, ::2], pole[::2, ::2]
     masks = Masks(lane > 0, pole > 0, lane.astype(np.float32), pole.astype(np.float32), 0.5, 0.5)
-    return CameraImage(pixels), masks
+    return CameraImage(pixels), masks, tuple(match(T, found) for found in POLES)
 
 
 def match(T: np.ndarray, pole: tuple[float, float, float]) -> LineMatch:
@@ -135,6 +138,7 @@ class Drive:
             return "suspect", "first_threshold", "The test for yaw has passed its first threshold.", SUSPECT_S
         return "drifted", "second_threshold", "The drift of yaw is sure and was held for 4 s.", DRIFTED_S
 
+    @cache  # noqa: B019 # a handful of drives in a session
     def drift(self, second: float) -> Drift:
         rng = np.random.default_rng(int(second * 10))
         yaw = 0.8 * min(1.0, max(0.0, (second - DRIFT_S) / 8.0))
@@ -190,8 +194,7 @@ class Drive:
         return Status.model_validate(fields | changes)
 
     def frame(self, second: float) -> FrameEvent:
-        T_true = T_STORED if second < DRIFT_S else T_DRIFTED
-        image, masks = seen(T_true)
+        image, masks, matches = scene(moved=second >= DRIFT_S)
         drift = np.array([0.0, 0.0, math.radians(self.drift(second).yaw.value or 0.0), 0.0, 0.0, 0.0])
         return FrameEvent(
             pair=self.pair,
@@ -204,7 +207,7 @@ class Drive:
             edge_points=EDGES,
             T_stored=T_STORED,
             T_estimated=se3.displaced(T_STORED, drift, se3.AXES_CAM_IN_VEHICLE) if second >= 1 else None,
-            matches=tuple(match(T_true, pole) for pole in POLES),
+            matches=matches,
         )
 
     def events(self, end: EndEvent | None = None, frames_hz: int = 2) -> Iterator[Event]:
@@ -222,7 +225,7 @@ def drive() -> Callable[..., Drive]:
 
 @pytest.fixture
 def small_files() -> Callable[[int], object]:
-    """Within ``small_files(n)`` no file of this process grows beyond n bytes, as on a disk that is full then."""
+    """Within ``small_files(n)`` no file of this process grows beyond n bytes: a disk that is full then."""
 
     @contextmanager
     def limited(size: int) -> Iterator[None]:

@@ -1,0 +1,120 @@
+"""What people read: a verdict in one sentence, stamps, sizes with their unit, and what to do next."""
+
+from datetime import UTC, datetime, timedelta
+
+from monitor.status import AxisDrift, AxisName, State, Status, unit_of
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+_FIRST_DATE_NS = 946_684_800_000_000_000
+"""ns; 2000-01-01. A stamp before it counts from the start of something, not from 1970."""
+
+_LAST_DATE_NS = 253_402_300_799_000_000_000
+"""ns; the end of the year 9999, beyond which there is no date to tell."""
+
+_SURE_SIGMAS = 3.0
+"""An axis without a limit crossed is named as moved when its drift exceeds this many sigma."""
+
+NEXT_STEPS: dict[State, str] = {
+    "healthy": "Nothing to do. The axes that were not checked need other roads, or a `calibwatch baseline`, "
+    "before anything can be said of them.",
+    "drifted": "Look at the places below. If the points under the estimated extrinsic lie on the edges of "
+    "the image and those under the stored one do not, check the mount (bracket, windscreen, bolts), run "
+    "`calibwatch calibrate` on a recording made after that and take the result over with `calibwatch "
+    "extrinsic accept`. Until then do not rely on the projection between this LiDAR and this camera.",
+    "suspect": "Keep driving: more evidence settles it. If it stays suspect on several drives, inspect the "
+    "mount and learn a `calibwatch baseline`, which narrows what can be told.",
+    "unobservable": "No statement is possible from these scenes. Drive where there are poles, kerbs and lane "
+    "markings in good light; `calibwatch inspect` tells whether the inputs are what the rig file says.",
+    "stale": "Pairs of sweep and image stopped coming. Check drivers, cables and clocks; `calibwatch "
+    "inspect` lists topics, rates and gaps between the stamps.",
+    "fault": "The watch can not work until this is mended: the reason names it. `calibwatch config check` "
+    "tries rig file, model and folders.",
+    "starting": "Give it more data: a first verdict takes some ten seconds on a road with lanes and poles.",
+}
+"""What to do next, by state; words between backticks are commands."""
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """A stamp as UTC to the second's tenth, or as seconds where the clock did not start in 1970."""
+    if not _FIRST_DATE_NS <= stamp_ns <= _LAST_DATE_NS:
+        return f"{stamp_ns / 1e9:.1f} s"
+    moment = _EPOCH + timedelta(microseconds=stamp_ns // 1000)
+    return f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 100_000} UTC"
+
+
+def size_text(axis: AxisName, value: float | None, *, sign: bool = False) -> str:
+    """A size with its unit (``0.52 deg``, ``+0.123 m``), or 'unknown'."""
+    if value is None:
+        return "unknown"
+    unit = unit_of(axis)
+    digits = 2 if unit == "deg" else 3
+    return f"{value:{'+' if sign else ''}.{digits}f} {unit}"
+
+
+def axis_text(name: AxisName, axis: AxisDrift) -> str:
+    """Size, sigma and limit of one axis."""
+    return (
+        f"{name} {size_text(name, axis.value, sign=True)} "
+        f"(sigma {size_text(name, axis.sigma)}, limit {size_text(name, axis.alert_limit)})"
+    )
+
+
+def moved_axes(status: Status) -> tuple[AxisName, ...]:
+    """The axes that make the drift, worst first: those beyond their limit, else those that surely moved."""
+    seen = [
+        (name, abs(axis.value), axis.sigma, axis.alert_limit)
+        for name, axis in status.drift.items()
+        if axis.observable and axis.value is not None and axis.sigma
+    ]
+    ranked = sorted(seen, key=lambda row: row[1] / row[3], reverse=True)
+    beyond = tuple(name for name, size, _, limit in ranked if size > limit)
+    if beyond:
+        return beyond
+    by_sigma = sorted(seen, key=lambda row: row[1] / row[2], reverse=True)
+    sure = tuple(name for name, size, sigma, _ in by_sigma if size > _SURE_SIGMAS * sigma)
+    return sure or tuple(name for name, *_ in by_sigma[:1])
+
+
+def unchecked_text(status: Status) -> str:
+    """Which axes were not checked and why, or that all were."""
+    held = [name for name, axis in status.drift.items() if not axis.observable]
+    blunt = [name for name, axis in status.drift.items() if axis.observable and not axis.monitored]
+    parts = [f"{', '.join(held)} (not observable)"] if held else []
+    if blunt:
+        parts.append(f"{', '.join(blunt)} (too uncertain to exclude a drift of the limit)")
+    return f"not checked: {'; '.join(parts)}" if parts else "all six axes were checked"
+
+
+def verdict_sentence(status: Status) -> str:
+    """The verdict in one sentence: state, axis, size, sigma, limit, since when, and what was not checked."""
+    moved = " and ".join(axis_text(name, status.drift[name]) for name in moved_axes(status))
+    axes = [axis_text(name, axis) for name, axis in status.drift.items() if axis.monitored]
+    watched = ", ".join(axes) or "no axis"
+    since = stamp_text(status.since_ns)
+    bodies: dict[State, str] = {
+        "healthy": f"healthy since {since}: a drift beyond the limits is excluded for {watched}",
+        "drifted": f"drifted ({status.severity or 'minor'}): {moved}, {_onset_text(status)}",
+        "suspect": f"suspect since {since}: {moved or 'the evidence'} is not yet sure",
+        "unobservable": f"without a statement since {since}: {_clause(status.reason)}",
+        "stale": f"stale since {since}: {_clause(status.reason)}",
+        "fault": f"not being watched since {since}: {_clause(status.reason)}",
+        "starting": f"not judged yet: {_clause(status.reason)}",
+    }
+    checked = status.state in ("healthy", "drifted", "suspect", "unobservable")
+    return f"{status.pair} is {bodies[status.state]}{'; ' + unchecked_text(status) if checked else ''}."
+
+
+def _onset_text(status: Status) -> str:
+    onset = status.onset
+    if onset is None:
+        return f"told since {stamp_text(status.since_ns)}"
+    earliest, latest = stamp_text(onset.from_ns), stamp_text(onset.to_ns)
+    return f"since {stamp_text(onset.stamp_ns)} (between {earliest} and {latest})"
+
+
+def _clause(sentence: str) -> str:
+    """A sentence as part of another: no full stop, no leading capital but of an abbreviation."""
+    clause = sentence.rstrip(". ")
+    head, _, _ = clause.partition(" ")
+    return clause if head[1:] != head[1:].lower() else clause[:1].lower() + clause[1:]

@@ -5,27 +5,32 @@ A rig comes from a rig file (TOML or JSON), from ``calib.json``, or from what a 
 """
 
 import dataclasses
-import difflib
 import json
 import math
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, field_validator
 
 from monitor.messages import CameraInfo
+from monitor.rig_document import (
+    Axis,
+    CameraSection,
+    ExtrinsicSection,
+    Pairing,
+    PairSection,
+    SweepStamp,
+    nearest,
+    validated,
+)
 from monitor.sources import TopicInfo
+from pipeline.cameras import lens_of
 from pipeline.errors import CalibwatchError, InputError, RigError
 from pipeline.records import AXES, CameraModel, Floats
 from pipeline.se3 import orthonormalised, stored_before
-
-NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-"""What a vehicle or pair may be called: one chunk of a key."""
 
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", "foxglove.PointCloud")
 """Types that carry a sweep; folders give ``file/<suffix>``."""
@@ -43,128 +48,6 @@ _ROUNDING = 1e-3
 """Largest entry of ``R R^T - I`` that passes as rounding: six digits give 1e-5, a wrong matrix far more."""
 _LARGEST_FILE = 8 << 20
 """bytes; a rig file is a few kB."""
-
-Axis: TypeAlias = Literal["roll", "pitch", "yaw", "forward", "left", "up"]
-Pairing: TypeAlias = Literal["stamps", "sequence"]
-SweepStamp: TypeAlias = Literal["start", "middle", "end"]
-_Name = Annotated[str, StringConstraints(pattern=rf"^{NAME.pattern}$")]
-_Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-_Matrix4 = Annotated[list[_Row], Field(min_length=4, max_length=4)]
-_Matrix3 = Annotated[
-    list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)
-]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class LidarSection(_Section):
-    """Where the sweeps come from."""
-
-    topic: str | None = Field(
-        default=None, description="topic, key expression or folder; absent: the only one of its kind"
-    )
-    frame: str = Field(default="", description="frame id of the points, as tf names it")
-    type: str | None = Field(default=None, description="message type where the bus does not tell it")
-    spin: Literal["cw", "ccw"] | None = Field(
-        default=None, description="sense of rotation seen from above, for sweeps without times per point"
-    )
-    stamp: SweepStamp = Field(default="start", description="the instant of the sweep that its stamp means")
-
-
-class CameraSection(_Section):
-    """Where the images come from, and the intrinsics where no CameraInfo gives them."""
-
-    topic: str | None = Field(
-        default=None, description="topic, key expression or folder; absent: the only one of its kind"
-    )
-    info: str | None = Field(default=None, description="topic of its CameraInfo")
-    frame: str = Field(default="", description="optical frame id, as tf names it")
-    type: str | None = Field(default=None, description="message type where the bus does not tell it")
-    rectified: bool | None = Field(
-        default=None, description="whether P of CameraInfo holds (true) or K, D (false); absent: see spec"
-    )
-    model: str | None = Field(default=None, description="lens model, default plumb_bob, pinhole without D")
-    K: _Matrix3 | None = Field(default=None, description="camera matrix, px")
-    D: list[float] = Field(default=[], max_length=14, description="distortion in the order of OpenCV")
-    width: int | None = Field(default=None, gt=0, le=65536, json_schema_extra={"unit": "px"})
-    height: int | None = Field(default=None, gt=0, le=65536, json_schema_extra={"unit": "px"})
-
-
-class ExtrinsicSection(_Section):
-    """The stored extrinsic and how well it is known (C_ref of FORMULAS F2)."""
-
-    store: _Name | None = Field(default=None, description="name in the extrinsic store, in place of a matrix")
-    T_cam_lidar: _Matrix4 | None = Field(default=None, description="maps LiDAR points into the camera frame")
-    sigma_deg: float = Field(
-        default=0.1, gt=0, le=10, description="what a good target calibration reaches", json_schema_extra={"unit": "deg"}
-    )
-    sigma_m: float = Field(
-        default=0.02, gt=0, le=1, description="what a good target calibration reaches", json_schema_extra={"unit": "m"}
-    )
-
-
-class LimitsSection(_Section):
-    """Alert limits: what matters to this vehicle's perception (AL of FORMULAS D3, per axis)."""
-
-    roll_deg: float = Field(default=0.75, gt=0, le=45, json_schema_extra={"unit": "deg"})
-    pitch_deg: float = Field(default=0.5, gt=0, le=45, json_schema_extra={"unit": "deg"})
-    yaw_deg: float = Field(default=0.5, gt=0, le=45, json_schema_extra={"unit": "deg"})
-    forward_m: float = Field(default=0.20, gt=0, le=5, json_schema_extra={"unit": "m"})
-    left_m: float = Field(default=0.15, gt=0, le=5, json_schema_extra={"unit": "m"})
-    up_m: float = Field(default=0.15, gt=0, le=5, json_schema_extra={"unit": "m"})
-
-
-class PairSection(_Section):
-    """One LiDAR and one camera that watch the same scene."""
-
-    name: _Name
-    lidar: LidarSection = LidarSection()
-    camera: CameraSection = CameraSection()
-    max_gap_ms: float = Field(
-        default=50.0,
-        gt=0,
-        le=1000,
-        description="half a period of the usual 10 Hz: a nearer partner always exists when none is lost",
-        json_schema_extra={"unit": "ms"},
-    )
-    pairing: Pairing = Field(
-        default="stamps",
-        description="'sequence': image n goes with cloud n whatever the stamps say (folders that list pairs)",
-    )
-    extrinsic: ExtrinsicSection | None = Field(default=None, description="absent: taken from tf_static")
-    T_vehicle_lidar: _Matrix4 | None = Field(default=None, description="maps LiDAR points into base_link")
-    limits: LimitsSection = LimitsSection()
-    required: list[Axis] = Field(
-        default=["pitch", "yaw"], min_length=1, description="axes that must be monitored for 'healthy'"
-    )
-
-    @field_validator("extrinsic", mode="before")
-    @classmethod
-    def _from_store(cls, value: object) -> object:
-        if isinstance(value, str):
-            kind, _, name = value.partition(":")
-            if kind != "store":
-                raise ValueError('as text it is "store:NAME"')
-            return {"store": name}
-        return value
-
-
-class RigDocument(_Section):
-    """The rig file."""
-
-    vehicle: _Name = "vehicle"
-    pairs: list[PairSection] = Field(min_length=1, max_length=64)
-
-
-_SECTIONS: dict[str, type[_Section]] = {
-    "pairs": PairSection,
-    "lidar": LidarSection,
-    "camera": CameraSection,
-    "extrinsic": ExtrinsicSection,
-    "limits": LimitsSection,
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,10 +174,7 @@ def parse_rig(document: Mapping[str, object], *, where: str) -> Rig:
     """
     if "pairs" not in document and "T_cam_lidar" in document:
         document = calib_document(document, where=where)
-    try:
-        parsed = RigDocument.model_validate(document)
-    except ValidationError as error:
-        raise _refusal(error, where) from error
+    parsed = validated(document, where=where)
     names = [pair.name for pair in parsed.pairs]
     for name in names:
         if names.count(name) > 1:
@@ -379,15 +259,17 @@ def _camera_model(section: CameraSection, where: str) -> CameraModel | None:
     if section.width is None or section.height is None:
         raise RigError(f"{where} has K but no width and height", hint="give the size of the images in px")
     try:
-        return CameraModel(
+        camera = CameraModel(
             model=section.model or ("plumb_bob" if section.D else "pinhole"),
             K=np.array(section.K, dtype=np.float64),
             D=np.array(section.D, dtype=np.float64),
             width=section.width,
             height=section.height,
         )
+        lens_of(camera)
     except InputError as error:
         raise RigError(f"{where}: {error.what}", hint=error.hint) from error
+    return camera
 
 
 def _rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
@@ -410,28 +292,6 @@ def _rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
     return T
 
 
-def _refusal(error: ValidationError, where: str) -> RigError:
-    """The first complaint of pydantic in our words."""
-    first = error.errors()[0]
-    location = first["loc"]
-    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
-    if first["type"] == "extra_forbidden":
-        owner: type[_Section] = RigDocument
-        for part in location[:-1]:
-            owner = _SECTIONS.get(str(part), owner)
-        return RigError(f"{where}: {path} is not a known key", hint=nearest(str(location[-1]), owner.model_fields))
-    if first["type"] == "literal_error":
-        return RigError(f"{where}: {path} is {first['input']!r}", hint=f"wanted {first['ctx']['expected']}")
-    return RigError(f"{where}: {path}: {first['msg']}", hint="see `calibwatch config schema`")
-
-
-def nearest(name: str, valid: Sequence[str] | Mapping[str, object]) -> str:
-    """A hint: the valid name that is nearest to ``name``, then all of them."""
-    close = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
-    known = f"known: {', '.join(valid)}"
-    return f"did you mean '{close[0]}'? {known}" if close else known
-
-
 def bind(rig: Rig, topics: Sequence[TopicInfo], *, where: str) -> Rig:
     """The rig with every topic named, each of which is in the recording.
 
@@ -448,7 +308,9 @@ def bind(rig: Rig, topics: Sequence[TopicInfo], *, where: str) -> Rig:
         wanted = (lidar, camera, *([pair.camera.info] if pair.camera.info else []))
         for topic in wanted:
             if topic not in known:
-                raise InputError(f"{where} has no topic {topic} (pair {pair.name})", hint=nearest(topic, known))
+                raise InputError(
+                    f"{where} has no topic {topic} (pair {pair.name})", hint=nearest(topic, known)
+                )
         pairs.append(
             dataclasses.replace(
                 pair,
@@ -482,10 +344,10 @@ def is_image(type_name: str) -> bool:
 def camera_from_info(info: CameraInfo, *, rectified: bool | None, topic: str) -> tuple[CameraModel, str]:
     """Which reading of a CameraInfo holds for the images of ``topic``, and why in one clause.
 
-    ``rectified`` of the rig wins. Else a topic whose last chunks say "rect" holds rectified images: P. Else K and D:
-    where D is zero and P has the same K both readings agree (KITTI: the images were rectified before they were
-    recorded, K is that of P). The fourth column of P and the rotation R are never used: they lead from one camera of
-    a stereo rig to another, which the extrinsic already states.
+    ``rectified`` of the rig wins. Else a topic whose last chunks say "rect" holds rectified images: P.
+    Else K and D: where D is zero and P has the same K both readings agree (KITTI: the images were
+    rectified before they were recorded, K is that of P). The fourth column of P and the rotation R are
+    never used: they lead from one camera of a stereo rig to another, which the extrinsic already states.
 
     Raises:
         RigError: The rig says rectified but the message has no P.
@@ -524,7 +386,9 @@ def parse_inject(text: str) -> Floats:
         try:
             value = float(number)
         except ValueError as error:
-            raise RigError(f"--inject: '{number}' is no number for {name}", hint="as in yaw=0.5,up=0.05") from error
+            raise RigError(
+                f"--inject: '{number}' is no number for {name}", hint="as in yaw=0.5,up=0.05"
+            ) from error
         if not math.isfinite(value):
             raise RigError(f"--inject: {name} is {number}", hint="a finite number, as in yaw=0.5,up=0.05")
         index = AXES.index(name)
@@ -533,13 +397,15 @@ def parse_inject(text: str) -> Floats:
 
 
 def inject(pair: RigPair, drift: Floats) -> RigPair:
-    """The pair with its stored extrinsic altered so that the true drift is ``drift`` (6,), rad and m (DESIGN 2).
+    """The pair, its stored extrinsic altered so that the true drift is ``drift`` (6,), rad, m (DESIGN 2).
 
     Raises:
         RigError: The pair has no extrinsic yet.
     """
     if pair.T_cam_lidar is None:
-        raise RigError(f"pair {pair.name} has no extrinsic to alter", hint="give one in the rig file or by tf_static")
+        raise RigError(
+            f"pair {pair.name} has no extrinsic to alter", hint="give one in the rig file or by tf_static"
+        )
     R_vehicle_lidar = None if pair.T_vehicle_lidar is None else pair.T_vehicle_lidar[:3, :3]
     try:
         stored = stored_before(pair.T_cam_lidar, drift, R_vehicle_lidar)

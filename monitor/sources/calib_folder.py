@@ -1,24 +1,29 @@
-"""A folder with ``calib.json``: the pairs that its ``frames[]`` lists, else the KITTI drive inside, else one pair.
+"""A folder with ``calib.json``: the pairs that its ``frames[]`` lists, else the KITTI drive inside, else one.
 
-Further cameras have their own ``calib_<CAMERA>.json`` with their own frames; the pair is then called like the camera.
-Pairs are given, not searched: cloud n and image n of a pair carry the sequence number n, and the rig of the folder says
-``pairing = "sequence"``, so that stamps which differ by more than the gap limit (or are absent) part nothing.
+Further cameras have their own ``calib_<CAMERA>.json`` with their own frames; the pair is then called like the
+camera. Pairs are given, not searched: cloud n and image n of a pair carry the sequence number n, and the rig of
+the folder says ``pairing = "sequence"``, so that stamps which differ by more than the gap limit (or are absent)
+part nothing.
 """
 
 import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from monitor.rig import CLOUD_SUFFIXES, IMAGE_SUFFIXES, NAME, calib_document
+from monitor.rig import CLOUD_SUFFIXES, IMAGE_SUFFIXES, calib_document
+from monitor.rig_document import NAME
 from monitor.sources import Losses
 from monitor.sources.kitti_raw import (
     NOMINAL_PERIOD_NS,
-    SOURCE as KITTI_RAW,
     FolderSource,
     Frame,
     drives_in,
     image_type,
     read_json,
+    sweep_s,
+)
+from monitor.sources.kitti_raw import (
+    SOURCE as KITTI_RAW,
 )
 from pipeline.errors import InputError
 
@@ -59,7 +64,7 @@ SOURCE = CalibFolder()
 
 
 def _calibs(folder: Path, calib: dict[str, object]) -> dict[str, tuple[Path, dict[str, object]]]:
-    """Calib files by the name of the pair; ``calib.json`` is left out where a named file lists the same frames."""
+    """Calib files by the name of the pair, less ``calib.json`` where a named file lists the same frames."""
     further: dict[str, tuple[Path, dict[str, object]]] = {}
     for path in sorted(folder.glob("calib_*.json")):
         match = _CAMERA_FILE.fullmatch(path.name)
@@ -69,7 +74,9 @@ def _calibs(folder: Path, calib: dict[str, object]) -> dict[str, tuple[Path, dic
         return further
     name = calib.get("camera_name", "camera")
     if not isinstance(name, str) or not NAME.fullmatch(name):
-        raise InputError(f"{folder / 'calib.json'}: camera_name is {name!r}", hint=f"it matches {NAME.pattern}")
+        raise InputError(
+            f"{folder / 'calib.json'}: camera_name is {name!r}", hint=f"it matches {NAME.pattern}"
+        )
     return {name: (folder / "calib.json", calib), **further}
 
 
@@ -77,9 +84,13 @@ def _frames(folder: Path, path: Path, calib: Mapping[str, object], lidar: str, c
     """Cloud and image of every pair that a calib file lists, or of the only pair."""
     listed = calib.get("frames")
     if listed is None:
-        listed = [{"image": _only(folder, "image", IMAGE_SUFFIXES), "cloud": _only(folder, "cloud", CLOUD_SUFFIXES)}]
+        listed = [
+            {"image": _only(folder, "image", IMAGE_SUFFIXES), "cloud": _only(folder, "cloud", CLOUD_SUFFIXES)}
+        ]
     if not isinstance(listed, list) or not listed:
-        raise InputError(f"{path}: 'frames' is no list of pairs", hint="leave it out, or list image and cloud")
+        raise InputError(
+            f"{path}: 'frames' is no list of pairs", hint="leave it out, or list image and cloud"
+        )
     frames = []
     for index, entry in enumerate(listed):
         where = f"{path}: frames[{index}]"
@@ -97,7 +108,7 @@ def _frames(folder: Path, path: Path, calib: Mapping[str, object], lidar: str, c
                 topic=lidar,
                 type=_cloud_type(cloud, where),
                 stamp_ns=stamp,
-                sweep_s=(t_end - t_cloud) * 1e-9 if t_cloud is not None and t_end is not None and t_end > t_cloud else None,
+                sweep_s=sweep_s(t_cloud, t_end),
                 sequence=index,
             ),
             Frame(
@@ -141,18 +152,22 @@ def _cloud_type(path: Path, where: str) -> str:
     for suffix in sorted(CLOUD_SUFFIXES, key=len, reverse=True):
         if name.endswith(f".{suffix}"):
             return f"file/{suffix}"
-    raise InputError(f"{where}: cloud {path.name} is of no known kind", hint=f"known: {', '.join(CLOUD_SUFFIXES)}")
+    raise InputError(
+        f"{where}: cloud {path.name} is of no known kind", hint=f"known: {', '.join(CLOUD_SUFFIXES)}"
+    )
 
 
 def _image_type(path: Path, where: str) -> str:
     kind = image_type(path)
     if kind.removeprefix("file/") not in IMAGE_SUFFIXES:
-        raise InputError(f"{where}: image {path.name} is of no known kind", hint=f"known: {', '.join(IMAGE_SUFFIXES)}")
+        raise InputError(
+            f"{where}: image {path.name} is of no known kind", hint=f"known: {', '.join(IMAGE_SUFFIXES)}"
+        )
     return kind
 
 
 def _time_ns(entry: Mapping[str, object], key: str, where: str) -> int | None:
-    """Seconds in a file as ns, to the microsecond: the digits of a double end at 0.2 us for today's stamps."""
+    """Seconds in a file as ns, to the microsecond: today's stamps have no finer digits in a double."""
     value = entry.get(key)
     if value is None:
         return None

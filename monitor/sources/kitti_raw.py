@@ -1,9 +1,9 @@
 """KITTI raw: a drive folder (``2011_09_26_drive_0009_sync``), or a folder that contains exactly one.
 
-Stamps: where ``timestamps_start.txt`` and ``timestamps_end.txt`` exist, a cloud carries the instant of its FIRST point
-and the duration of its sweep. Elsewhere it carries ``timestamps.txt``, which is the instant at which the laser looks
-ahead, and no duration: image and cloud are then compared as they are. Without any stamps the nominal 10 Hz stand in.
-KITTI's stamps have no time zone; they are read as UTC.
+Stamps: where ``timestamps_start.txt`` and ``timestamps_end.txt`` exist, a cloud carries the instant of its
+FIRST point and the duration of its sweep. Elsewhere it carries ``timestamps.txt``, which is the instant at
+which the laser looks ahead, and no duration: image and cloud are then compared as they are. Without any
+stamps the nominal 10 Hz stand in. KITTI's stamps have no time zone; they are read as UTC.
 """
 
 import itertools
@@ -139,10 +139,15 @@ class KittiRaw:
         drives = drives_in(Path(location))
         if len(drives) != 1:
             listed = ", ".join(drive.name for drive in drives[:8])
-            raise InputError(f"{location} contains {len(drives)} KITTI drives: {listed}", hint="name one of them")
+            raise InputError(
+                f"{location} contains {len(drives)} KITTI drives: {listed}", hint="name one of them"
+            )
         drive = drives[0]
         losses = Losses()
-        frames = [*_frames(drive / "velodyne_points", LIDAR_TOPIC), *_frames(drive / "image_02", CAMERA_TOPIC)]
+        frames = [
+            *_frames(drive / "velodyne_points", LIDAR_TOPIC),
+            *_frames(drive / "image_02", CAMERA_TOPIC),
+        ]
         for folder in ("velodyne_points", "image_02"):
             if not (drive / folder / "timestamps.txt").exists():
                 losses.notes.append(f"{folder} has no timestamps.txt: nominal 10 Hz")
@@ -155,9 +160,18 @@ SOURCE = KittiRaw()
 def drives_in(folder: Path) -> list[Path]:
     """The drive folders at ``folder`` or at most two levels below it."""
     levels = ("", "*", "*/*")
-    found = itertools.chain.from_iterable(folder.glob(f"{level}/velodyne_points/data".lstrip("/")) for level in levels)
+    found = itertools.chain.from_iterable(
+        folder.glob(f"{level}/velodyne_points/data".lstrip("/")) for level in levels
+    )
     drives = (data.parent.parent for data in found)
     return sorted(drive for drive in drives if (drive / "image_02" / "data").is_dir())
+
+
+def sweep_s(start_ns: int | None, end_ns: int | None) -> float | None:
+    """Duration of a sweep in s, or None where its first or last point has no stamp or they are reversed."""
+    if start_ns is None or end_ns is None or end_ns <= start_ns:
+        return None
+    return (end_ns - start_ns) * 1e-9
 
 
 def image_type(path: Path) -> str:
@@ -176,15 +190,15 @@ def _frames(folder: Path, topic: str) -> list[Frame]:
     frames = []
     for index, path in enumerate(files):
         start, end, middle = (_of(path, index, len(files), lines) for lines in (starts, ends, middles))
-        known = start is not None and end is not None and end > start
-        stamp = start if known else middle
+        duration = sweep_s(start, end)
+        stamp = middle if duration is None else start
         frames.append(
             Frame(
                 path=path,
                 topic=topic,
                 type=image_type(path) if topic == CAMERA_TOPIC else "file/bin",
                 stamp_ns=_number(path, index) * NOMINAL_PERIOD_NS if stamp is None else stamp,
-                sweep_s=(end - start) * 1e-9 if start is not None and end is not None and end > start else None,
+                sweep_s=duration,
             )
         )
     return frames
@@ -220,13 +234,13 @@ def _stamp_ns(line: str, path: Path, number: int) -> int | None:
         return None
     match = _STAMP.fullmatch(line)
     try:
-        if match is None:
-            raise ValueError(line)
-        second = datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-    except ValueError as error:
+        second = datetime.fromisoformat(match[1]).replace(tzinfo=UTC) if match else None
+    except ValueError:
+        second = None
+    if match is None or second is None:
         raise InputError(
             f"{path}:{number}: '{line[:40]}' is no time stamp", hint="as in 2011-09-26 13:08:27.657852672"
-        ) from error
+        )
     return int(second.timestamp()) * 1_000_000_000 + int((match[2] or "").ljust(9, "0"))
 
 
@@ -264,7 +278,9 @@ def _document(location: Path, drive: Path, losses: Losses) -> dict[str, object] 
         paths = (folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt")
         if all(path.is_file() for path in paths):
             return kitti_document(*(_calib(path) for path in paths), where=str(folder))
-    losses.notes.append("no calib.json and no calib_cam_to_cam.txt, calib_velo_to_cam.txt: a rig file is needed")
+    losses.notes.append(
+        "no calib.json and no calib_cam_to_cam.txt, calib_velo_to_cam.txt: a rig file is needed"
+    )
     return None
 
 
@@ -273,8 +289,8 @@ def kitti_document(
 ) -> dict[str, object]:
     """The rig of the rectified left colour camera, in the form of the rig file.
 
-    ``T_cam_lidar = [I | K^-1 P_rect_02(:,4)] R_rect_00 [R|T]``: points go into camera 00, are turned by its rectifying
-    rotation, and move into camera 02 by the fourth column of its projection matrix.
+    ``T_cam_lidar = [I | K^-1 P_rect_02(:,4)] R_rect_00 [R|T]``: points go into camera 00, are turned by
+    its rectifying rotation, and move into camera 02 by the fourth column of its projection matrix.
 
     Args:
         cameras: Rows of ``calib_cam_to_cam.txt`` by name.
@@ -290,7 +306,9 @@ def kitti_document(
         shift = np.linalg.solve(K, P[:, 3])
     except np.linalg.LinAlgError as error:
         raise InputError(f"{where}: P_rect_02 has no inverse") from error
-    T_cam_lidar = transform(np.eye(3), shift) @ transform(R_rect, np.zeros(3)) @ transform(R, t)
+    T_cam_lidar = (
+        transform(np.eye(3), shift.astype(np.float64)) @ transform(R_rect, np.zeros(3)) @ transform(R, t)
+    )
     calib = {
         "camera": {"K": K.tolist(), "D": [], "width": width, "height": height},
         "T_cam_lidar": T_cam_lidar.tolist(),
@@ -301,7 +319,9 @@ def kitti_document(
 def _row(rows: Mapping[str, Floats], name: str, count: int, where: str) -> Floats:
     row = rows.get(name)
     if row is None or len(row) != count:
-        raise InputError(f"{where}: the calib files have no {name} of {count} numbers", hint="KITTI's own files do")
+        raise InputError(
+            f"{where}: the calib files have no {name} of {count} numbers", hint="KITTI's own files do"
+        )
     return row
 
 

@@ -1,25 +1,31 @@
 """MCAP files: everything that is whole is given, what is damaged is counted and told (spec: losses).
 
-With an intact index chunks are read in the order of their first message and merged; without one (truncated files) the
-file is read from its start and chunks are merged one ahead, so that messages come in the order of log time as far as
-the order of the chunks allows. Every chunk's CRC is checked; a damaged chunk costs its own messages and no others.
+With an intact index chunks are read in the order of their first message and merged; without one (truncated
+files) the file is read from its start and chunks are merged one ahead, so that messages come in the order
+of log time as far as the order of the chunks allows. Every chunk's CRC is checked; a damaged chunk costs
+its own messages and no others.
 """
 
 import heapq
+import os
 import struct
+import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-import lz4.frame
+import lz4.frame  # type: ignore[import-untyped]  # lz4 ships no types
 import zstandard
 from mcap import records
-from mcap.exceptions import EndOfFile, McapError
-from mcap.reader import make_reader
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 from monitor.messages import Encoding, Message, codecs
 from monitor.sources import Losses, TopicInfo
@@ -31,6 +37,18 @@ _LARGEST_RECORD = 1 << 30
 _LARGEST_BACKLOG = 512 << 20
 """bytes of messages that wait for their turn; beyond it order gives way to memory."""
 _ENCODINGS: dict[str, Encoding] = {"cdr": "cdr", "ros1": "ros1", "protobuf": "protobuf"}
+_HEAD = struct.Struct("<BQ")
+"""Opcode and length of a record."""
+_FOOTER = struct.Struct("<BQQQI8s")
+"""Footer record and closing magic."""
+_READERS: dict[int, Callable[[ReadDataStream, int], records.McapRecord]] = {
+    Opcode.SCHEMA: lambda stream, _: records.Schema.read(stream),
+    Opcode.CHANNEL: lambda stream, _: records.Channel.read(stream),
+    Opcode.MESSAGE: records.Message.read,
+    Opcode.CHUNK: lambda stream, _: records.Chunk.read(stream),
+    Opcode.FOOTER: lambda stream, _: records.Footer.read(stream),
+}
+"""What is read; other records are passed over."""
 _DAMAGE = (
     McapError,
     CRCValidationError,
@@ -43,6 +61,10 @@ _DAMAGE = (
     OverflowError,
 )
 """What mcap, zstandard and lz4 (RuntimeError) raise on damaged bytes."""
+
+
+class _Skipped:
+    """A whole record of no interest."""
 
 
 @dataclass(slots=True)
@@ -68,12 +90,14 @@ class McapFile:
         self.losses = Losses()
         self._path = path
         self._file = _opened(path)
+        self._size = path.stat().st_size
         self._index = self._read_index()
         self._channels = dict(self._index.channels) if self._index else {}
         self._schemas = dict(self._index.schemas) if self._index else {}
         self._read: Counter[int] = Counter()
         self._bad_chunks = 0
         self._bad_at: int | None = None
+        self._end: int | None = None
         self._foreign: set[str] = set()
 
     def __enter__(self) -> Self:
@@ -141,7 +165,9 @@ class McapFile:
     def _read_index(self) -> _Index | None:
         """The summary, or None where the end of the file is missing or damaged."""
         try:
-            summary = make_reader(self._file, validate_crcs=True, record_size_limit=_LARGEST_RECORD).get_summary()
+            _check_summary(self._file, self._size)
+            self._file.seek(0)
+            summary = SeekingReader(self._file, record_size_limit=_LARGEST_RECORD).get_summary()
         except (*_DAMAGE, OSError):
             return None
         if summary is None or summary.statistics is None:
@@ -160,27 +186,44 @@ class McapFile:
         """The first log time and the messages of each whole chunk (or of each message outside chunks)."""
         if self._index is not None and self._index.chunks:
             for entry in self._index.chunks:
-                yield from self._indexed_chunk(entry)
+                chunk = self._record(entry.chunk_start_offset)
+                if isinstance(chunk, records.Chunk):
+                    yield from self._chunk(chunk, entry.chunk_start_offset)
+                else:
+                    self._damaged_chunk(entry.chunk_start_offset)
             return
-        self._file.seek(0)
-        reader = StreamReader(
-            self._file, emit_chunks=True, validate_crcs=False, record_size_limit=_LARGEST_RECORD
-        )
-        whole = 0
-        try:
-            for record in reader.records:
-                offset, whole = whole, self._file.tell()
-                yield from self._streamed(record, offset)
-        except _DAMAGE as error:
-            self._bad_at = whole if self._bad_at is None else self._bad_at
-            kind = "ends in the middle of a record" if isinstance(error, EndOfFile) else "is damaged"
-            self.losses.add("rest_of_file")
-            self._rest = f"the file {kind} after byte {whole}"
+        offset = len(MAGIC)
+        record: records.McapRecord | _Skipped | None = None
+        while not isinstance(record, records.Footer):
+            record = self._record(offset)
+            if record is None:
+                self._end = offset
+                self.losses.add("rest_of_file")
+                return
+            yield from self._streamed(record, offset)
+            offset = self._file.tell()
 
-    _rest = ""
+    def _record(self, offset: int) -> "records.McapRecord | _Skipped | None":
+        """The record at ``offset``; None where it is damaged or reaches beyond the end of the file."""
+        self._file.seek(offset)
+        head = self._file.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            return None
+        opcode, length = _HEAD.unpack(head)
+        if length > min(self._size - offset - _HEAD.size, _LARGEST_RECORD) or not _known(opcode):
+            return None
+        reader = _READERS.get(opcode)
+        if reader is None:
+            self._file.seek(length, os.SEEK_CUR)
+            return _Skipped()
+        body = self._file.read(length)
+        try:
+            return reader(ReadDataStream(BytesIO(body)), length)
+        except _DAMAGE:
+            return None
 
     def _streamed(
-        self, record: records.McapRecord, offset: int
+        self, record: "records.McapRecord | _Skipped", offset: int
     ) -> Iterator[tuple[int, list[records.Message]]]:
         if isinstance(record, records.Schema):
             self._schemas[record.id] = record
@@ -191,20 +234,6 @@ class McapFile:
             yield record.log_time, [record]
         elif isinstance(record, records.Chunk):
             yield from self._chunk(record, offset)
-
-    def _indexed_chunk(self, entry: records.ChunkIndex) -> Iterator[tuple[int, list[records.Message]]]:
-        self._file.seek(entry.chunk_start_offset)
-        reader = StreamReader(
-            self._file, skip_magic=True, emit_chunks=True, record_size_limit=_LARGEST_RECORD
-        )
-        try:
-            record = next(reader.records, None)
-        except _DAMAGE:
-            record = None
-        if isinstance(record, records.Chunk):
-            yield from self._chunk(record, entry.chunk_start_offset)
-        else:
-            self._damaged_chunk(entry.chunk_start_offset)
 
     def _chunk(self, chunk: records.Chunk, offset: int) -> Iterator[tuple[int, list[records.Message]]]:
         """The messages of a chunk, by log time; nothing where its bytes do not fit its CRC."""
@@ -263,14 +292,17 @@ class McapFile:
         expected = sum(self._index.counts.values()) if self._index else None
         if expected is not None and expected > read:
             self.losses.add("damaged_message", expected - read)
-        if self._bad_at is None:
-            if self._index is None:
-                self.losses.notes.append(f"the summary at the end of the file is missing or damaged; {read} messages read")
-            return
-        of = f" of {expected}" if expected is not None else ""
-        damage = f"{self._bad_chunks} damaged chunks" if self._bad_chunks else "nothing damaged before"
-        rest = f"; {self._rest}" if self._rest else ""
-        self.losses.notes.append(f"{read}{of} messages read; {damage}, the first after byte {self._bad_at}{rest}")
+        clauses = []
+        if self._bad_at is not None:
+            clauses.append(f"{self._bad_chunks} damaged chunks, the first after byte {self._bad_at}")
+        if self._end is not None:
+            clauses.append(f"the rest is missing or damaged after byte {self._end} of {self._size}")
+        elif self._index is None:
+            clauses.append("the summary at its end is missing or damaged")
+        if clauses or (expected is not None and expected != read):
+            of = f" of {expected}" if expected is not None else ""
+            told = ", ".join(clauses) or "its summary counts others"
+            self.losses.notes.append(f"{self._path.name}: {read}{of} messages read; {told}")
 
 
 class McapKind:
@@ -323,6 +355,25 @@ def _opened(path: Path) -> IO[bytes]:
         what = "is empty" if not head else "is no MCAP file"
         raise InputError(f"{path} {what}", hint="an MCAP file starts with the bytes 89 4D 43 41 50 30 0D 0A")
     return file
+
+
+def _known(opcode: int) -> bool:
+    """Whether an opcode is one of the format or of an extension (0x80 and above)."""
+    return 0 < opcode <= max(Opcode) or opcode >= 0x80
+
+
+def _check_summary(file: IO[bytes], size: int) -> None:
+    """Refuses a summary that does not fit its CRC: its counts and offsets would be believed."""
+    file.seek(-_FOOTER.size, os.SEEK_END)
+    tail = file.read(_FOOTER.size)
+    opcode, length, start, _, crc, magic = _FOOTER.unpack(tail)
+    if opcode != Opcode.FOOTER or length != 20 or magic != MAGIC or start > size - _FOOTER.size:
+        raise ValueError(opcode)
+    if crc:
+        file.seek(start or size - _FOOTER.size)
+        end = size - len(MAGIC) - 4
+        if end - file.tell() > _LARGEST_RECORD or zlib.crc32(file.read(end - file.tell())) != crc:
+            raise ValueError(crc)
 
 
 def _check_size(chunk: records.Chunk) -> None:

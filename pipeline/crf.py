@@ -7,9 +7,10 @@ Every pixel sees every pixel. With features ``f`` in units of their standard dev
     Q(0) = softmax(-U)
     Q(t+1) = softmax_l(-U_l + w_l sum_k c_k K~_k Q_l(t))
 
-Smoothness is a separable blur, exact to float32. Appearance lives in five dimensions (x, y, three colours) and is
-summed over a permutohedral lattice (Adams, Baek and Davis 2010): each pixel hands its value to the six corners of
-the simplex it lies in, the corners are blurred along six directions, each pixel reads its corners again.
+Smoothness is a separable blur, exact to float32. Appearance lives in five dimensions (x, y, three colours)
+and is summed over a permutohedral lattice (Adams, Baek and Davis 2010): each pixel hands its value to the six
+corners of the simplex it lies in, the corners are blurred along six directions, each pixel reads its corners
+again.
 """
 
 from collections.abc import Callable
@@ -35,7 +36,8 @@ class SmoothnessKernel:
     Attributes:
         sigma_x_px: Standard deviation along the row, px of the grid that is labelled.
         sigma_y_px: Along the column, px.
-        compat: Gain in energy where all neighbours agree, nats; 3 takes away a lone pixel of probability 0.95.
+        compat: Gain in energy where all neighbours agree, nats; 3 takes away a lone pixel of probability
+            0.95.
     """
 
     sigma_x_px: float
@@ -54,7 +56,8 @@ class AppearanceKernel:
     Attributes:
         sigma_x_px: Standard deviation along the row, px of the grid that is labelled.
         sigma_y_px: Along the column, px.
-        sigma_colour: Standard deviation per colour channel, grey levels of 0..255, in the image's channel order.
+        sigma_colour: Standard deviation per colour channel, grey levels of 0..255, in the image's channel
+            order.
         compat: Gain in energy where all like pixels agree, nats.
     """
 
@@ -75,9 +78,10 @@ class CrfParameters:
     Attributes:
         smoothness: Kernel over position, or None.
         appearance: Kernel over position and colour, or None.
-        iterations: Parallel updates. Five: later ones move less than 1 % of the pixels in the published method.
-        class_weights: One factor per class on what a class gains from agreement (diagonal compatibility); a class
-            below 1 spreads less. Empty: all 1, the plain Potts model.
+        iterations: Parallel updates. Five: later ones move less than 1 % of the pixels in the published
+            method.
+        class_weights: One factor per class on what a class gains from agreement (diagonal compatibility); a
+            class below 1 spreads less. Empty: all 1, the plain Potts model.
     """
 
     smoothness: SmoothnessKernel | None
@@ -106,15 +110,16 @@ def mean_field(
         unary: float32 (C,h,w), energies -log p in nats; a constant per pixel does not matter.
         image: uint8 (h,w,3), any channel order that ``sigma_colour`` shares.
         parameters: Kernels and number of updates.
-        region: bool (h,w), the pixels that take part and see each other; all others keep ``softmax(-unary)`` and
-            are seen by nobody. None: all take part.
+        region: bool (h,w), the pixels that take part and see each other; all others keep ``softmax(-unary)``
+            and are seen by nobody. None: all take part.
 
     Returns:
         float32 (C,h,w), sums to one over the classes.
 
     Raises:
         InputError: Shapes do not fit, or an energy is not finite.
-        RigError: As many class weights as classes are needed, or kernels too narrow for the size of the image.
+        RigError: As many class weights as classes are needed, or kernels too narrow for the size of the
+            image.
     """
     _require_fitting(unary, image, parameters)
     if region is None:
@@ -122,7 +127,7 @@ def mean_field(
     if region.shape != image.shape[:2] or region.dtype != np.bool_:
         raise InputError(f"CRF: region {region.dtype}{region.shape} is no mask of image {image.shape}")
     all_q = _softmax(np.ascontiguousarray(-unary.reshape(len(unary), -1).T, dtype=np.float32))
-    if parameters.iterations and region.any():
+    if parameters.iterations and len(unary) > 1 and region.any():
         inside = np.flatnonzero(region)
         minus_u = np.ascontiguousarray(-unary.reshape(len(unary), -1)[:, inside].T, dtype=np.float32)
         all_q[inside] = _iterate(minus_u, all_q[inside], _kernels(image, region, parameters), parameters)
@@ -269,10 +274,10 @@ def _lattice(features: Floats32) -> Filter:
 
 
 def _corners(features: Floats32) -> tuple[NDArray[np.int64], Floats32, NDArray[np.int64]]:
-    """The d+1 corners of each pixel's simplex: key int64 (d+1,N), share float32 (d+1,N), strides int64 (d,).
+    """Corners of each pixel's simplex: key int64 (d+1,N), share float32 (d+1,N), strides int64 (d,).
 
-    A corner has integer coordinates ``(d+1) a_i + k`` that sum to zero, with the same remainder k in all of them; its
-    key is ``k + (d+1) sum_i strides_i a_i`` over all coordinates but the last.
+    A corner has integer coordinates ``(d+1) a_i + k`` that sum to zero, with the same remainder k in all of
+    them; its key is ``k + (d+1) sum_i strides_i a_i`` over all coordinates but the last.
     """
     d = len(features)
     elevated = _elevation(d) @ features / np.float32(d + 1)
@@ -311,7 +316,7 @@ def _corners(features: Floats32) -> tuple[NDArray[np.int64], Floats32, NDArray[n
 
 
 def _elevation(d: int) -> Floats32:
-    """float32 (d+1,d): embeds features in the plane of zero sum, so that the lattice's blur has unit variance."""
+    """Embedding of features in the plane of zero sum, float32 (d+1,d); there the blur has unit variance."""
     E = np.zeros((d + 1, d))
     for j in range(1, d + 1):
         E[:j, j - 1] = 1.0
@@ -327,8 +332,8 @@ _HASH_FACTOR = np.int64(-7046029254386353131)
 def _numbered(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """``np.unique(keys, return_inverse=True)``, several times faster where most keys occur often.
 
-    All equal keys meet in one bucket; whoever was written there last stands for them if it is their equal. The few
-    whose bucket was taken by another key are their own stand-ins, and only the stand-ins are sorted.
+    All equal keys meet in one bucket; whoever was written there last stands for them if it is their equal.
+    The few whose bucket was taken by another key are their own stand-ins, and only the stand-ins are sorted.
     """
     bits = min(22, max(8, len(keys).bit_length() + 1))
     bucket = (keys * _HASH_FACTOR).view(np.uint64) >> np.uint64(64 - bits)
@@ -367,7 +372,8 @@ def _blur_steps(vertices: NDArray[np.int64], strides: NDArray[np.int64]) -> list
     """One matrix (M,M) per lattice direction: half of oneself, a quarter of the vertex at each side."""
     d, count = len(strides), len(vertices)
     remainder = vertices % (d + 1)
-    # One step adds 1 to every coordinate and takes d+1 from one of them; remainder d carries into every coordinate.
+    # One step adds 1 to every coordinate and takes d+1 from one of them; remainder d carries into every
+    # coordinate.
     plus_one = np.where(remainder == d, (d + 1) * int(strides.sum()) - d, 1)
     steps = []
     for stride in [*strides.tolist(), 0]:

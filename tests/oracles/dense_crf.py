@@ -8,7 +8,7 @@ Floats = NDArray[np.float64]
 
 def _softmax(energy: Floats) -> Floats:
     raised = np.exp(energy - energy.max(axis=0))
-    return raised / raised.sum(axis=0)
+    return np.asarray(raised / raised.sum(axis=0), dtype=np.float64)
 
 
 def normalised_kernel(features: Floats) -> Floats:
@@ -17,7 +17,7 @@ def normalised_kernel(features: Floats) -> Floats:
     distance2 = np.maximum(squares[:, None] + squares[None] - 2.0 * features @ features.T, 0.0)
     kernel = np.exp(-0.5 * distance2)
     weight = 1.0 / np.sqrt(kernel.sum(axis=1) + 1e-20)
-    return kernel * weight[:, None] * weight[None]
+    return np.asarray(kernel * weight[:, None] * weight[None], dtype=np.float64)
 
 
 def mean_field_exact(
@@ -39,7 +39,9 @@ def mean_field_exact(
     kernels: list[tuple[float, Floats]] = []
     if smoothness is not None:
         (sx, sy), compat = smoothness
-        kernels.append((compat, normalised_kernel(np.column_stack([columns.ravel() / sx, rows.ravel() / sy]))))
+        kernels.append(
+            (compat, normalised_kernel(np.column_stack([columns.ravel() / sx, rows.ravel() / sy])))
+        )
     if appearance is not None:
         (sx, sy), colour, compat = appearance
         features = np.column_stack(

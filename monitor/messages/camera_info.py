@@ -128,6 +128,8 @@ def _crop(msg: RosCameraInfo) -> tuple[int, int, int, int, int, int]:
 def _cropped(camera: CameraModel, crop: tuple[int, int, int, int, int, int]) -> CameraModel:
     """The camera of the delivered image: pixel u of it covers sensor px ``x + b u .. x + b u + b - 1``."""
     x, y, width, height, bin_x, bin_y = crop
+    if (x, y, width, height, bin_x, bin_y) == (0, 0, camera.width, camera.height, 1, 1):
+        return camera
     shift = np.array(
         [
             [1 / bin_x, 0, -(x + (bin_x - 1) / 2) / bin_x],
@@ -135,7 +137,9 @@ def _cropped(camera: CameraModel, crop: tuple[int, int, int, int, int, int]) -> 
             [0, 0, 1],
         ]
     )
-    return CameraModel(camera.model, shift @ camera.K, camera.D, width // bin_x, height // bin_y)
+    with np.errstate(over="ignore", invalid="ignore"):  # a K that overflows is refused by CameraModel
+        K = shift @ camera.K
+    return CameraModel(camera.model, K, camera.D, width // bin_x, height // bin_y)
 
 
 CODECS: dict[str, Codec] = {TYPE: decode}

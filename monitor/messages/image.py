@@ -19,6 +19,12 @@ RAW = "sensor_msgs/msg/Image"
 _JPEG_STANDALONE = frozenset((0x01, *range(0xD0, 0xD8)))
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
+_MOST_JPEG_SEGMENTS = 1000
+"""Segments (and fill bytes) before the frame header; cameras write ten, a long ICC profile some hundred."""
+
+_OS2_HEADER = struct.pack("<I", 12)
+"""Length of the oldest BMP header, the only one with sizes of 16 bits."""
+
 
 def decode_compressed(message: Message) -> tuple[Decoded, ...]:
     """The pixels of a CompressedImage; what it is tells its content, not the ``format`` string.
@@ -75,6 +81,9 @@ def picture_size(data: memoryview) -> tuple[int, int]:
         if head.startswith(b"\x89PNG\r\n\x1a\n"):
             width, height = struct.unpack_from(">II", head, 16)
             return int(width), int(height)
+        if head.startswith(b"BM") and head[14:18] == _OS2_HEADER:
+            width, height = struct.unpack_from("<HH", head, 18)
+            return int(width), int(height)
         if head.startswith(b"BM"):
             width, height = struct.unpack_from("<ii", head, 18)
             return int(width), abs(int(height))
@@ -91,7 +100,7 @@ def picture_size(data: memoryview) -> tuple[int, int]:
 def _jpeg_size(data: memoryview) -> tuple[int, int]:
     """Size in the frame header of a JPEG: segments are walked by their lengths (ITU T.81, B.1.1)."""
     at = 2
-    while True:
+    for _ in range(_MOST_JPEG_SEGMENTS):
         prefix, marker = struct.unpack_from(">BB", data, at)
         if prefix != 0xFF:
             raise InputError(f"the JPEG has no marker at byte {at}")
@@ -103,6 +112,7 @@ def _jpeg_size(data: memoryview) -> tuple[int, int]:
             return int(width), int(height)
         (length,) = struct.unpack_from(">H", data, at + 2)
         at += 2 + max(2, length)
+    raise InputError(f"the JPEG tells no size in its first {_MOST_JPEG_SEGMENTS} segments")
 
 
 def encode_compressed(

@@ -5,7 +5,7 @@ from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as P
 from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointField as PointField
 
 from monitor.messages import Codec, Decoded, Message, ros
-from monitor.messages.point_fields import Field, Packing, cloud_of, packed_columns
+from monitor.messages.point_fields import KNOWN, Field, Packing, cloud_of, packed_columns
 from pipeline.errors import InputError
 from pipeline.records import PointCloud
 
@@ -21,7 +21,11 @@ def decode(message: Message) -> tuple[Decoded, ...]:
     """
     msg = ros.deserialize(message, PointCloud2, TYPE)
     order = ">" if msg.is_bigendian else "<"
-    fields = [Field(field.name, field.offset, _dtype(field, order)) for field in msg.fields]
+    fields = [
+        Field(field.name, field.offset, _dtype(field, order))
+        for field in msg.fields
+        if field.name.lower() in KNOWN
+    ]
     columns = packed_columns(msg.data, Packing(msg.width, msg.height, msg.point_step, msg.row_step, fields))
     stamp_ns = ros.stamp_ns(msg.header.stamp)
     return (Decoded(stamp_ns, ros.frame_name(msg.header.frame_id), cloud_of(columns, stamp_ns)),)

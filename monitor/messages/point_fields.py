@@ -12,6 +12,7 @@ Field names are compared in lower case. What a field means is settled here and n
 - time (:data:`TIME`): see :func:`seconds_after`.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -31,6 +32,9 @@ INTENSITY = ("intensity", "i", "reflectivity", "reflectance")
 RING = ("ring", "channel", "laser_id", "line", "laser", "beam")
 TIME = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
 
+KNOWN = frozenset(("x", "y", "z", *INTENSITY, *RING, *TIME))
+"""Fields that :func:`cloud_of` reads; the others need not even be of a type that is known."""
+
 QUANTILE = 0.999
 """Share of points that may lie beyond the nominal intensity scale: retroreflectors and glitches."""
 
@@ -38,9 +42,11 @@ LONGEST_SWEEP_S = 2.0
 """s; spinning sensors take 0.05 to 0.2 s, slow scanners up to 1 s. A span beyond it is read in a finer unit,
 or not."""
 
-_ABSOLUTE_SCALES = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
-"""Smallest value and ns per unit of clocks counted from 1970 in ns, us, ms, s: every date from 1973 to
-5138."""
+_CLOCKS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
+"""Least value and ns per unit of clocks counted from 1970 in ns, us, ms, s: dates from 1973 to 5138."""
+
+_UPTIME = {True: 10**8, False: 10**11}
+"""Values of floats (True) and integers below it count from the sweep or the sensor's start, never from 1970."""
 
 
 class Field(NamedTuple):
@@ -79,7 +85,7 @@ def packed_columns(data: memoryview | NDArray[np.uint8], packing: Packing) -> di
     columns: dict[str, Column] = {}
     for field in fields:
         name = field.name.lower()
-        if name in columns or name not in ("x", "y", "z", *INTENSITY, *RING, *TIME):
+        if name in columns or name not in KNOWN:
             continue
         end = field.offset + field.dtype.itemsize
         if end > point_step:
@@ -90,6 +96,32 @@ def packed_columns(data: memoryview | NDArray[np.uint8], packing: Packing) -> di
         columns[name] = np.ndarray(
             (height, width), field.dtype, buffer=data, offset=field.offset, strides=(row_step, point_step)
         ).reshape(-1)
+    return columns
+
+
+def text_columns(tokens: Sequence[bytes], fields: Sequence[Field], per_point: int) -> dict[str, Column]:
+    """Columns of the fields that :func:`cloud_of` knows from numbers written as text.
+
+    Args:
+        tokens: The numbers, point by point.
+        fields: ``offset`` counts numbers, not bytes.
+        per_point: Numbers of one point.
+
+    Raises:
+        InputError: A token is no number, or not one of its field's type.
+    """
+    columns: dict[str, Column] = {}
+    for field in fields:
+        name = field.name.lower()
+        if name in columns or name not in KNOWN:
+            continue
+        chosen = tokens[field.offset :: per_point]
+        read = float if field.dtype.kind == "f" else int
+        try:
+            with np.errstate(over="ignore"):  # beyond float32 is inf, which is dropped
+                columns[name] = np.fromiter(map(read, chosen), field.dtype, len(chosen))
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"field '{field.name}': {error}", hint="the file is damaged") from error
     return columns
 
 
@@ -162,11 +194,12 @@ def _whole(values: Column) -> NDArray[np.uint16] | None:
 def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
     """Times of points in seconds after the stamp of the sweep, or None where they tell nothing.
 
-    Integers count ns, floats s; floats that span more than :data:`LONGEST_SWEEP_S` are read as ms, us or ns,
-    whichever makes a sweep of them. Clocks counted from 1970 (s, ms, us or ns by their size) are told
-    relative to ``stamp_ns``, or to their own earliest point where the two clocks are further apart than a
-    sweep lasts: LiDAR clocks often run on another epoch than the header's. Times that are all equal (a
-    converter's filler), not finite, or span more than a sweep in any unit say nothing.
+    The unit is the first of these in which the points span at most :data:`LONGEST_SWEEP_S`: that of a clock counted
+    from 1970, by the size of the numbers (s, ms, us or ns); ns for integers; s, ms, us, ns for floats. Clocks
+    from 1970 are told relative to ``stamp_ns``, others count from it. Where that puts the first point further from
+    the stamp than a sweep lasts, the clock is another one (another epoch, the sensor's uptime) and times count from
+    the earliest point. Times that are all equal (a converter's filler), not finite, or that make no sweep in any
+    unit say nothing.
 
     Args:
         values: (N,), any integer or float type.
@@ -174,37 +207,27 @@ def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
     """
     if not len(values):
         return np.empty(0, np.float32)
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
+    real = values.dtype.kind == "f"
+    if real and not np.isfinite(values).all():
         return None
-    low, high = values.min(), values.max()
+    low, high = values.min().item(), values.max().item()
     if low == high:
         return None
-    scale = next((ns for least, ns in _ABSOLUTE_SCALES if low >= least), None)
-    if scale is not None and (values.dtype.kind == "f" or low >= 10**11):
-        origin = int(low)
-        after = _ns_after(values, origin, scale)
-        offset_ns = origin * scale - stamp_ns
-        if abs(offset_ns) > LONGEST_SWEEP_S * 1e9:
-            offset_ns = -int(after.min())
-    else:
-        after = _relative_ns(values, float(high) - float(low))
-        offset_ns = 0
-    if float(after.max()) - float(after.min()) > LONGEST_SWEEP_S * 1e9:
+    since_1970 = next((ns for least, ns in _CLOCKS if low >= least), None) if low >= _UPTIME[real] else None
+    units = (*(() if since_1970 is None else (since_1970,)), *((10**9, 10**6, 10**3, 1) if real else (1,)))
+    unit = next((ns for ns in units if (high - low) * ns <= LONGEST_SWEEP_S * 1e9), None)
+    if unit is None:
         return None
-    return ((after + offset_ns) * 1e-9).astype(np.float32)
+    origin = math.floor(low)  # whole units: the difference is taken first, so that nothing rounds
+    after_ns = _since(values, origin) * unit
+    first_ns = origin * unit - (stamp_ns if unit == since_1970 else 0)
+    offset_ns = -float(after_ns.min()) if abs(first_ns) > LONGEST_SWEEP_S * 1e9 else float(first_ns)
+    return ((after_ns + offset_ns) * 1e-9).astype(np.float32)
 
 
-def _ns_after(values: Column, origin: int, scale: int) -> NDArray[np.float64]:
-    """Nanoseconds since ``origin`` (whole units of ``scale`` ns): the difference first, so nothing rounds."""
+def _since(values: Column, origin: int) -> NDArray[np.float64]:
+    """``values - origin`` without rounding or overflow: their span is known to be small."""
     if values.dtype.kind == "f":
-        return (values.astype(np.float64) - origin) * scale
-    after: NDArray[np.float64] = (values - np.array(origin, values.dtype)).astype(np.float64)
-    return after * scale
-
-
-def _relative_ns(values: Column, span: float) -> NDArray[np.float64]:
-    """Nanoseconds of times that count from the sweep's own stamp."""
-    if values.dtype.kind != "f":
-        return values.astype(np.float64)
-    unit_ns = next((ns for ns in (1e9, 1e6, 1e3) if span * ns <= LONGEST_SWEEP_S * 1e9), 1.0)
-    return values.astype(np.float64) * unit_ns
+        return values.astype(np.float64) - float(origin)
+    wide = np.uint64 if values.dtype.kind == "u" else np.int64
+    return (values.astype(wide) - wide(origin)).astype(np.float64)

@@ -1,7 +1,7 @@
 """Overlays of the report: the same place under the stored and under the estimated extrinsic.
 
-A frame is kept compressed, with the points and lines that either extrinsic puts into the image. Places are chosen
-where the two extrinsics differ most in pixels, points are enough to see it, and the image has edges to judge by.
+A frame is kept compressed, with the points and lines that either extrinsic puts into the image. Places are
+chosen where the extrinsics differ most in pixels, points are enough to see it, and the image has edges.
 """
 
 from dataclasses import dataclass
@@ -129,8 +129,8 @@ def overlay(frame: KeptFrame, most_places: int) -> Overlay:
     crops = tuple(
         Crop(
             place,
-            _drawn(image, frame, place, frame.T_stored, stored, STORED_BGR),
-            _drawn(image, frame, place, frame.T_estimated, estimated, ESTIMATED_BGR),
+            _drawn(image, frame, place, T=frame.T_stored, uv=stored, colour=STORED_BGR),
+            _drawn(image, frame, place, T=frame.T_estimated, uv=estimated, colour=ESTIMATED_BGR),
         )
         for place in places
     )
@@ -186,7 +186,7 @@ def _overlap(a: Place, b: Place) -> bool:
 
 
 def _drawn(
-    image: Pixels, frame: KeptFrame, place: Place, T: Floats, uv: Floats, colour: tuple[int, int, int]
+    image: Pixels, frame: KeptFrame, place: Place, *, T: Floats, uv: Floats, colour: tuple[int, int, int]
 ) -> bytes:
     """One place, enlarged, with points and matched lines under one extrinsic."""
     zoom = _CROP_SHOWN_PX / place.width

@@ -37,6 +37,13 @@ class Series:
             return tuple(self._kept)
         return (*self._kept, self._newest)
 
+    def thinned(self, most: int) -> tuple[Sample, ...]:
+        """At most ``most`` (two or more) of the samples, evenly, first and newest among them."""
+        samples = self.samples
+        if len(samples) <= most:
+            return samples
+        return tuple(samples[round(i * (len(samples) - 1) / (most - 1))] for i in range(most))
+
     def note(self, status: Status) -> None:
         """Takes the next status of the pair."""
         axes = [status.drift[name] for name in AXIS_NAMES]

@@ -1,0 +1,143 @@
+"""``report.html``: one self-contained page that a person opens: verdict, plots, overlays, what to do next."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from monitor.events import EndEvent, Event, FrameEvent, StatusEvent
+from monitor.outputs import OutputKind, folder_of, write_whole
+from monitor.outputs._history import History
+from monitor.outputs._overlays import KeptFrame, Overlay, keep, overlay
+from monitor.outputs._report_page import PairMaterial, page, picture_bytes
+from monitor.outputs._series import Series
+from monitor.status import State, Status
+
+FILE_NAME = "report.html"
+
+_MOST_SAMPLES = 4000
+"""samples over all pairs in one page: 100 bytes each, and more than a plot has pixels."""
+
+_PICTURES_BYTES = 950_000
+"""bytes of pictures in one page: with plots and script it stays below 1.5 MB, which mail still carries."""
+
+_PLACES = 3
+"""places shown of the frame that tells most."""
+_PLACES_BEFORE = 1
+"""places shown of the frame that shows how it was before."""
+
+
+class _PairRecord:
+    """What is kept of one pair: the last frame of each state, compressed, and the newest as it came."""
+
+    def __init__(self, first: Status) -> None:
+        self.history = History(first)
+        self.first_ns = first.stamp_ns
+        self.series = Series(_MOST_SAMPLES)
+        self._newest: FrameEvent | None = None
+        self._kept: dict[State, KeptFrame] = {}
+
+    def note(self, status: Status) -> None:
+        """Takes the next status."""
+        if status.state != self.history.last.state:
+            self._keep_newest()
+        self.history.note(status)
+        self.series.note(status)
+
+    def show(self, frame: FrameEvent) -> None:
+        """Takes the next frame."""
+        if frame.T_estimated is not None:
+            self._newest = frame
+
+    def telling(self) -> Iterator[tuple[str, KeptFrame, int]]:
+        """(title, frame, places) of the frames to show, the most telling first."""
+        self._keep_newest()
+        told: State | None = next((s for s in ("drifted", "suspect") if s in self._kept), None)
+        if told is None:
+            told = next(reversed(self._kept), None)
+        if told is not None:
+            yield f"Stored against estimated, while {told}", self._kept[told], _PLACES
+        if told in ("drifted", "suspect") and "healthy" in self._kept:
+            yield "For comparison, while healthy", self._kept["healthy"], _PLACES_BEFORE
+
+    def _keep_newest(self) -> None:
+        frame = keep(self._newest) if self._newest is not None else None
+        self._newest = None
+        if frame is not None:
+            state = self.history.last.state
+            self._kept.pop(state, None)
+            self._kept[state] = frame
+
+
+class Report:
+    """Collects what the page shows, in bounded memory, and writes it at the end."""
+
+    def __init__(self, folder: Path, vehicle: str) -> None:
+        self._path = folder / FILE_NAME
+        self._vehicle = vehicle
+        self._pairs: dict[str, _PairRecord] = {}
+
+    @property
+    def lost(self) -> str | None:
+        """Never: a failed write is raised where it happens."""
+        return None
+
+    def handle(self, event: Event) -> None:
+        """Takes note; writes the page at the end, whether the run was complete or not."""
+        if isinstance(event, StatusEvent):
+            status = event.status
+            if status.pair not in self._pairs:
+                self._pairs[status.pair] = _PairRecord(status)
+            self._pairs[status.pair].note(status)
+        elif isinstance(event, FrameEvent):
+            if event.pair in self._pairs:
+                self._pairs[event.pair].show(event)
+        else:
+            self._write(event)
+
+    def close(self) -> None:
+        """Lets go of what was collected."""
+        self._pairs.clear()
+
+    def _write(self, end: EndEvent) -> None:
+        records = [record for _, record in sorted(self._pairs.items())]
+        pictures, left_out = _pictures(records)
+        most = max(2, _MOST_SAMPLES // max(1, len(records)))
+        pairs = tuple(
+            PairMaterial(
+                last=record.history.last,
+                timeline=record.history.timeline,
+                first_ns=record.first_ns,
+                samples=record.series.thinned(most),
+                overlays=tuple(pictures[place]),
+                overlays_left_out=left_out[place],
+            )
+            for place, record in enumerate(records)
+        )
+        write_whole(self._path, page(self._vehicle, pairs, end).encode())
+
+
+def _pictures(records: list[_PairRecord]) -> tuple[list[list[tuple[str, Overlay]]], list[int]]:
+    """Overlays per pair as far as the page may grow, the most telling of every pair first."""
+    shown: list[list[tuple[str, Overlay]]] = [[] for _ in records]
+    left_out = [0] * len(records)
+    room = _PICTURES_BYTES
+    wanted = [
+        (rank, index, title, frame, places)
+        for index, record in enumerate(records)
+        for rank, (title, frame, places) in enumerate(record.telling())
+    ]
+    for _, index, title, frame, places in sorted(wanted, key=lambda want: want[:2]):
+        for fewer in range(places, 0, -1):
+            drawn = overlay(frame, fewer)
+            size = picture_bytes(drawn)
+            if size <= room:
+                room -= size
+                shown[index].append((title, drawn))
+                break
+        else:
+            left_out[index] += 1
+    return shown, left_out
+
+
+OUTPUT = OutputKind(
+    "report", "folder", lambda surroundings: Report(folder_of(surroundings), surroundings.vehicle)
+)

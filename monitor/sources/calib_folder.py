@@ -1,9 +1,9 @@
 """A folder with ``calib.json``: the pairs that its ``frames[]`` lists, else the KITTI drive inside, else one.
 
-Further cameras have their own ``calib_<CAMERA>.json`` with their own frames; the pair is then called like the
-camera. Pairs are given, not searched: cloud n and image n of a pair carry the sequence number n, and the rig of
-the folder says ``pairing = "sequence"``, so that stamps which differ by more than the gap limit (or are absent)
-part nothing.
+Further cameras have their own ``calib_<CAMERA>.json`` with their own frames; the pair is then called like
+the camera. Pairs are given, not searched: cloud n and image n of a pair carry the sequence number n, and the
+rig of the folder says ``pairing = "sequence"``, so that stamps which differ by more than the gap limit (or are
+absent) part nothing.
 """
 
 import re

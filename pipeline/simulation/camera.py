@@ -1,0 +1,198 @@
+"""Images by ray casting through the project's own lens models, with the class of every pixel.
+
+Four rays a pixel on a rotated grid: edges of any direction are resolved to a quarter of a pixel.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from pipeline import labels
+from pipeline.cameras import undistort
+from pipeline.errors import InputError
+from pipeline.records import CameraImage, CameraModel, Floats, read_only
+from pipeline.simulation.raycast import Window, cast
+from pipeline.simulation.scene import Scene
+from pipeline.simulation.shading import View, shade
+from pipeline.simulation.shadows import ShadowMap
+from pipeline.simulation.solids import CORNERS, Solids
+from pipeline.simulation.surface import F32, Rays
+
+_GRID = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+"""px; places of the rays in a pixel (u, v): four different columns and rows."""
+_LENS_STEP_PX = 8
+"""px; the inverse lens is computed so often and interpolated by cubics: 1e-8 of the focal length at most."""
+_NEAR_M = 0.05
+"""m; solids are cut there to find their place in the image."""
+_GAMMA = 1.0 / 2.2
+_RANK = np.array([0, 8, 7, 2, 3, 1, 4, 0, 6], dtype=np.int32)
+"""Which class wins a pixel that is shared evenly: the thinner one."""
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optics:
+    """Rays of a camera in its own frame.
+
+    Attributes:
+        camera: Intrinsics.
+        rays: float32 (4,2,H,W), x and y at z = 1 for each pass.
+    """
+
+    camera: CameraModel
+    rays: F32
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rays", read_only(self.rays))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """How the sensor turns light into grey levels.
+
+    Attributes:
+        grey: Mean grey level that the exposure aims at.
+        blur: Standard deviation of the point spread, px.
+        vignetting: Loss of light in the corners, 0..1.
+        noise: Standard deviation at mid grey, grey levels.
+        tint: Gain of blue, green, red.
+    """
+
+    grey: float = 105.0
+    blur: float = 0.5
+    vignetting: float = 0.25
+    noise: float = 1.8
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A simulated image.
+
+    Attributes:
+        image: The image.
+        labels: uint8 (H,W), class of ``pipeline.labels`` that covers most of each pixel.
+    """
+
+    image: CameraImage
+    labels: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", read_only(self.labels))
+
+
+def optics_of(camera: CameraModel) -> Optics:
+    """The rays of a camera; InputError where its lens model folds inside the image."""
+    u = np.linspace(-1.0, camera.width, camera.width // _LENS_STEP_PX + 4)
+    v = np.linspace(-1.0, camera.height, camera.height // _LENS_STEP_PX + 4)
+    grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    xy = undistort(camera, grid).reshape(len(u), len(v), 2)
+    if not np.isfinite(xy).all():
+        raise InputError(
+            "the lens model folds inside the image", hint="a weaker distortion or a smaller image"
+        )
+    splines = [RectBivariateSpline(u, v, xy[:, :, k]) for k in range(2)]
+    rays = np.empty((len(_GRID), 2, camera.height, camera.width), dtype=np.float32)
+    for p, (du, dv) in enumerate(_GRID):
+        for k in range(2):
+            rays[p, k] = splines[k](np.arange(camera.width) + du, np.arange(camera.height) + dv).T
+    return Optics(camera, rays)
+
+
+def render(
+    scene: Scene,
+    shadows: ShadowMap,
+    optics: Optics,
+    T_world_cam: Floats,
+    time: float,
+    look: Look,
+    rng: np.random.Generator,
+) -> Picture:
+    """One image.
+
+    Args:
+        scene: What is seen.
+        shadows: ``shadow_map`` of the scene around the camera.
+        optics: ``optics_of`` the camera.
+        T_world_cam: float64 (4,4), maps camera to world.
+        time: Of the exposure (a global shutter), s.
+        look: Sensor.
+        rng: Noise.
+    """
+    solids = scene.solids_at(time)
+    R = T_world_cam[:3, :3].astype(np.float32)
+    x, y, z = (np.full((1, 1), T_world_cam[k, 3], dtype=np.float32) for k in range(3))
+    still = np.zeros((1, 1), dtype=np.float32)
+    windows = _windows(solids, optics, T_world_cam)
+    height, width = optics.rays.shape[2:]
+    radiance = np.zeros((3, height, width), dtype=np.float32)
+    classes = np.empty((len(_GRID), height, width), dtype=np.uint8)
+    for p, offset in enumerate(_GRID):
+        xy = optics.rays[p]
+        direction = np.stack([R[k, 0] * xy[0] + R[k, 1] * xy[1] + R[k, 2] for k in range(3)])
+        rays = Rays((x, y, z), direction, still)
+        hits = cast(scene, solids, rays, windows)
+        jitter = (0.25 * offset[0], 0.25 * offset[1])
+        view = View(scene, solids, rays, hits, shadows, jitter, float(optics.camera.K[0, 0]))
+        colour, classes[p] = shade(view)
+        radiance += np.float32(1.0 / len(_GRID)) * colour
+    return Picture(CameraImage(_developed(radiance, look, rng)), _voted(classes))
+
+
+def _windows(solids: Solids, optics: Optics, T_world_cam: Floats) -> list[Window]:
+    """Rows and columns in which each solid may be seen, from its corners cut at the near plane."""
+    corners = (solids.corners() - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+    depth = corners[:, :, 2]
+    a, b = (np.array([e[k] for e in _EDGES]) for k in range(2))
+    cut = (_NEAR_M - depth[:, a]) / np.where(depth[:, b] == depth[:, a], 1.0, depth[:, b] - depth[:, a])
+    crosses = (depth[:, a] < _NEAR_M) != (depth[:, b] < _NEAR_M)
+    on_plane = corners[:, a] + cut[:, :, None] * (corners[:, b] - corners[:, a])
+    points = np.concatenate([corners, on_plane], axis=1)
+    usable = np.concatenate([depth >= _NEAR_M, crosses], axis=1)
+    xy = points[:, :, :2] / np.where(usable, np.maximum(points[:, :, 2], _NEAR_M), 1.0)[:, :, None]
+    low = np.where(usable[:, :, None], xy, np.inf).min(axis=1)
+    high = np.where(usable[:, :, None], xy, -np.inf).max(axis=1)
+    x, y = optics.rays[:, 0], optics.rays[:, 1]
+    columns = (x.max(axis=(0, 1)) >= low[:, :1]) & (x.min(axis=(0, 1)) <= high[:, :1])
+    rows = (y.max(axis=(0, 2)) >= low[:, 1:]) & (y.min(axis=(0, 2)) <= high[:, 1:])
+    seen = np.flatnonzero(columns.any(axis=1) & rows.any(axis=1))
+    near = np.where(usable, points[:, :, 2], np.inf).min(axis=1)
+    return [(int(k), _extent(rows[k]), _extent(columns[k]), float(near[k])) for k in seen]
+
+
+def _extent(flags: NDArray[np.bool_]) -> slice:
+    return slice(int(np.argmax(flags)), len(flags) - int(np.argmax(flags[::-1])))
+
+
+def _voted(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The class with most rays in each pixel, the thinner one of equals."""
+    score = np.stack([16 * (classes == k).sum(axis=0) + _RANK[k] for k in range(len(labels.NAMES))])
+    # A class without a ray must not win by its rank.
+    return np.argmax(np.where(score >= 16, score, -1), axis=0).astype(np.uint8)
+
+
+def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Lens, exposure, tone curve and noise: radiance (3,H,W) to BGR uint8 (H,W,3)."""
+    light = np.ascontiguousarray(np.moveaxis(radiance, 0, -1)) * np.array(look.tint, dtype=np.float32)
+    height, width = light.shape[:2]
+    light = np.asarray(cv2.GaussianBlur(light, (0, 0), look.blur), dtype=np.float32)
+    v, u = np.linspace(-1, 1, height, dtype=np.float32), np.linspace(-1, 1, width, dtype=np.float32)
+    light *= (1.0 - np.float32(look.vignetting / 2) * (u[None, :] ** 2 + v[:, None] ** 2))[:, :, None]
+    gain = _exposure(light[::4, ::4], look.grey)
+    grey = np.clip(gain * light, 0.0, 1.0) ** np.float32(_GAMMA) * np.float32(255.0)
+    grain = rng.standard_normal(grey.shape, dtype=np.float32)
+    # Shot noise after the tone curve: about even over the grey levels, a little stronger in the dark.
+    grey += np.float32(look.noise) * grain * (1.2 - grey * np.float32(0.4 / 255.0))
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def _exposure(light: F32, target: float) -> np.float32:
+    """Gain that brings the mean grey level to the target."""
+    gain = 1.0
+    for _ in range(12):
+        mean = float((np.clip(gain * light, 0.0, 1.0) ** _GAMMA).mean()) * 255.0
+        gain *= (target / mean) ** (1.0 / _GAMMA)
+    return np.float32(gain)

@@ -1,0 +1,204 @@
+"""Colour and class of what rays of the camera met: materials, light, shadow, haze, sky. Colours are linear BGR."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import labels
+from pipeline.simulation.raycast import Hits, SolidPoints, places, solid_points
+from pipeline.simulation.scene import Scene
+from pipeline.simulation.shadows import ShadowMap, shaded_by_movers
+from pipeline.simulation.solids import Material, Solids
+from pipeline.simulation.surface import F32, KERB, RAISED, SKY, Rays
+from pipeline.simulation.textures import sample
+
+_HAZE_M = 700.0
+"""m; contrast falls to 37 % over this distance on a clear day."""
+_SUN_COLOUR = np.array([[0.84], [0.96], [1.05]], dtype=np.float32)
+_SKY_COLOUR = np.array([[1.12], [1.0], [0.92]], dtype=np.float32)
+_PAINT_ALBEDO = 0.62
+_GRASS = np.array([[0.035], [0.12], [0.075]], dtype=np.float32)
+_PAVING = np.array([[0.24], [0.26], [0.27]], dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What shading needs to know of one pass.
+
+    Attributes:
+        scene: The street.
+        solids: As they stand at the exposure.
+        rays: Rays with direction z_cam = 1, so that t is the depth.
+        hits: What they met.
+        shadows: Of what stands still.
+        jitter: Shift of the shadow map in this pass, m.
+        focal: px.
+    """
+
+    scene: Scene
+    solids: Solids
+    rays: Rays
+    hits: Hits
+    shadows: ShadowMap
+    jitter: tuple[float, float]
+    focal: float
+
+
+def shade(view: View) -> tuple[F32, NDArray[np.uint8]]:
+    """Radiance float32 (3,H,W) and class uint8 (H,W) of one pass."""
+    shape = view.hits.t.shape
+    colour = np.empty((3, shape[0] * shape[1]), dtype=np.float32)
+    classes = np.full(shape[0] * shape[1], labels.SKY, dtype=np.uint8)
+    what = view.hits.what.ravel()
+    sky = np.flatnonzero(what == SKY)
+    colour[:, sky] = _sky(view, sky)
+    ground = np.flatnonzero(what < SKY)
+    colour[:, ground], classes[ground] = _ground(view, ground)
+    points = solid_points(view.solids, view.rays, view.hits)
+    colour[:, points.pixels] = _solids(view, points)
+    classes[points.pixels] = view.solids.label[points.solid]
+    return colour.reshape(3, *shape), classes.reshape(shape)
+
+
+def _horizon(view: View) -> F32:
+    grey = np.array([[0.80], [0.78], [0.76]], dtype=np.float32)
+    return grey * np.float32(0.9 + 0.3 * view.scene.light.overcast)
+
+
+def _sky(view: View, pixels: NDArray[np.int64]) -> F32:
+    """Blue that pales towards the horizon, with clouds on a far plane."""
+    d = np.stack([view.rays.direction[k].ravel()[pixels] for k in range(3)])
+    rise = np.maximum(d[2] / np.sqrt((d * d).sum(axis=0)), np.float32(0.01))
+    pale = np.exp(-4.0 * rise)
+    zenith = np.array([[0.75], [0.42], [0.22]], dtype=np.float32)
+    blue = pale * _horizon(view) + (1.0 - pale) * zenith
+    stretch = np.float32(60.0) / (d[2] + np.float32(0.08))
+    clouds = sample(view.scene.textures.rough, d[0] * stretch, d[1] * stretch, 1.0)
+    cover = np.clip(0.45 * clouds + 1.6 * view.scene.light.overcast - 0.3, 0.0, 1.0)
+    white = np.float32(0.95) + 0.06 * clouds
+    return np.asarray(blue + cover * (white - blue), dtype=np.float32)
+
+
+def _detail(view: View, pixels: NDArray[np.int64], cell: float) -> F32:
+    """Share 0..1 of a texture of so large cells (m) that a pixel on the ground resolves."""
+    t = view.hits.t.ravel()[pixels]
+    return np.minimum(np.float32(2.0 * cell * view.focal * 1.5) / (t * t + 1e-6), np.float32(1.0))
+
+
+def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint8]]:
+    scene, noise = view.scene, view.scene.textures
+    what = view.hits.what.ravel()[pixels]
+    place = places(view.rays, view.hits, pixels)
+    x, y = place[0], place[1]
+    s, d = scene.surface.road_coordinates(x, y)
+    fine = sample(noise.fine, x, y, 40.0) * _detail(view, pixels, 0.025)
+    middle = sample(noise.fine, x, y, 7.0) * _detail(view, pixels, 0.15)
+    soft = sample(noise.rough, x, y, 1.3)
+    mottle = 1.0 + 0.13 * fine + 0.07 * middle + 0.06 * soft
+    repaired = sample(noise.rough, s, d, 0.35) > 1.35
+    asphalt = scene.asphalt * mottle * np.where(repaired, np.float32(0.72), np.float32(1.0))
+    albedo = np.repeat(asphalt[None, :], 3, axis=0)
+    classes = np.full(pixels.size, labels.ROAD, dtype=np.uint8)
+    raised, kerb = what == RAISED, what == KERB
+    verge = raised & (np.abs(d) - np.float32(scene.surface.kerb_left) > scene.surface.pavement)
+    slabs = raised & ~verge
+    joints = ((np.mod(s, 0.6) < 0.02) | (np.mod(d, 0.6) < 0.02)) & (_detail(view, pixels, 0.02) > 0.4)
+    albedo[:, slabs] = _PAVING * (mottle * np.where(joints, np.float32(0.6), np.float32(1.0)))[slabs]
+    albedo[:, verge] = _GRASS * np.exp(0.35 * fine + 0.3 * middle + 0.25 * soft)[verge]
+    albedo[:, kerb] = np.float32(0.33) * mottle[kerb]
+    classes[raised | kerb] = labels.OTHER
+    classes[verge] = labels.VEGETATION
+    painted = ~(raised | kerb) & scene.paint.covers(s, d)
+    worn = scene.wear * (1.0 + 0.7 * fine + 0.9 * middle + 0.5 * soft)[painted]
+    fresh = np.clip(1.0 - worn, 0.25, 1.0)
+    albedo[:, painted] = fresh * np.float32(_PAINT_ALBEDO) + (1.0 - fresh) * albedo[:, painted]
+    classes[painted] = labels.LANE
+    lit = view.shadows.lit(place, view.jitter)
+    lit &= ~shaded_by_movers(place, view.solids, len(scene.standing), scene.light, noise.grain)
+    facing = np.full(pixels.size, scene.light.sun[2], dtype=np.float32)
+    facing[kerb] *= np.float32(0.6)
+    light = _light(view, facing, lit, np.ones(pixels.size, dtype=np.float32))
+    return _hazed(view, pixels, albedo * light), classes
+
+
+def _light(view: View, facing: F32, lit: NDArray[np.bool_], open_sky: F32) -> F32:
+    """Irradiance (3,N) from sun and sky; ``open_sky`` is the share of the sky that the surface sees."""
+    light = view.scene.light
+    direct = np.float32(light.direct) * np.maximum(facing, np.float32(0.0)) * lit
+    return np.asarray(
+        direct * _SUN_COLOUR + np.float32(light.ambient) * open_sky * _SKY_COLOUR, dtype=np.float32
+    )
+
+
+def _hazed(view: View, pixels: NDArray[np.int64], radiance: F32) -> F32:
+    clear = np.exp(-view.hits.t.ravel()[pixels] / np.float32(_HAZE_M))
+    return np.asarray(clear * radiance + (1.0 - clear) * 0.6 * _horizon(view), dtype=np.float32)
+
+
+def _solids(view: View, points: SolidPoints) -> F32:
+    scene, noise = view.scene, view.scene.textures
+    material = view.solids.material[points.solid]
+    local = points.unit * view.solids.half.astype(np.float32)[points.solid].T
+    albedo = np.ascontiguousarray(view.solids.colour[points.solid].T)
+    swing = sample(noise.fine, local[0] + 0.7 * local[1], local[2] + 0.5 * local[1], 9.0)
+    leaves = material == Material.LEAVES
+    soft = sample(noise.rough, local[0] + local[1], local[2], 20.0)
+    near = np.minimum(np.float32(0.2 * view.focal) / view.hits.t.ravel()[points.pixels], np.float32(1.0))
+    albedo *= np.where(leaves, np.exp(near * (0.45 * swing + 0.35 * soft)), 1.0 + 0.04 * swing + 0.03 * soft)
+    _facade(view, points, local, albedo, np.flatnonzero(material == Material.FACADE))
+    _cabin(points, albedo, np.flatnonzero(material == Material.CABIN))
+    _plate(points, albedo, np.flatnonzero(material == Material.PLATE))
+    facing = np.einsum("i,in->n", scene.light.sun.astype(np.float32), points.normal)
+    facing = np.where(leaves, 0.35 + 0.65 * facing, facing)
+    lit = view.shadows.lit(points.place + np.float32(0.25) * points.normal, view.jitter)
+    open_sky = 0.6 + 0.4 * points.normal[2]
+    return _hazed(view, points.pixels, albedo * _light(view, facing, lit, open_sky.astype(np.float32)))
+
+
+def _facade(view: View, points: SolidPoints, local: F32, albedo: F32, chosen: NDArray[np.int64]) -> None:
+    """Rows of windows with frames; each building has its own pitch."""
+    if not chosen.size:
+        return
+    solid = points.solid[chosen]
+    unit = points.unit[:, chosen]
+    gable = np.abs(unit[0]) > np.abs(unit[1])
+    along = np.where(gable, local[1, chosen], local[0, chosen])
+    up = local[2, chosen] + view.solids.half.astype(np.float32)[solid, 2] - 0.5
+    pitch = np.float32(1.9) + 0.25 * (solid % 7).astype(np.float32)
+    storey = np.float32(2.7) + 0.1 * (solid % 5).astype(np.float32)
+    a, b = along / pitch, up / storey
+    in_a, in_b = a - np.floor(a), b - np.floor(b)
+    frame = (np.abs(in_a - 0.5) < 0.3) & (np.abs(in_b - 0.55) < 0.32) & (np.abs(unit[2]) < 0.999)
+    glass = (np.abs(in_a - 0.5) < 0.26) & (np.abs(in_b - 0.55) < 0.29) & frame
+    hue = sample(view.scene.textures.fine, np.floor(a) + 0.5, np.floor(b) + 7.0 * solid + 0.5, 1.0)
+    albedo[:, chosen[frame]] = np.float32(0.5)
+    albedo[:, chosen[glass]] = np.array([[0.09], [0.08], [0.07]]) * np.exp(0.6 * hue[glass])
+    plinth = up < 0.6
+    albedo[:, chosen[plinth]] *= np.float32(0.6)
+
+
+def _cabin(points: SolidPoints, albedo: F32, chosen: NDArray[np.int64]) -> None:
+    """Panes between pillars; they mirror a little of the sky."""
+    unit = np.abs(points.unit[:, chosen])
+    side = unit[1] > unit[0]
+    across = np.where(side, unit[0], unit[1])
+    pane = (
+        (unit[2] < 0.85) & (across < 0.92) & ~(side & (across < 0.05)) & (np.maximum(unit[0], unit[1]) > 0.98)
+    )
+    mirror = 0.04 + 0.1 * np.maximum(points.unit[2, chosen], 0.0)
+    albedo[:, chosen[pane]] = mirror[pane] * np.array([[1.1], [1.0], [0.95]])
+
+
+def _plate(points: SolidPoints, albedo: F32, chosen: NDArray[np.int64]) -> None:
+    """A light inner field or a light rim with a dark mark, by the index of the solid."""
+    unit = points.unit[:, chosen]
+    ordered = np.sort(np.abs(unit), axis=0)
+    # The thin axis is the one whose coordinate lies on the face: what remains spans the plate.
+    rim = ordered[1] > 0.78
+    mark = (ordered[0] < 0.22) & (ordered[1] < 0.6)
+    odd = points.solid[chosen] % 2 == 1
+    light = np.where(odd, ~rim & ~mark, rim)
+    albedo[:, chosen[light]] = np.float32(0.72)
+    dark = odd & mark
+    albedo[:, chosen[dark]] = np.float32(0.04)

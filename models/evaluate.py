@@ -1,7 +1,7 @@
-"""Measure a model on labelled sets: ``python -m models.evaluate --model F --data DIR [--split val]``.
+"""Measure a model on labelled sets: ``python -m models.evaluate --model F --data DIR``.
 
 Needs onnxruntime and no PyTorch: what is measured is the file that ships, fed as the run time feeds it. Per
-set and thin class: intersection over union, and precision and recall with a slack of 2 px at a width of 1280 px,
+set and thin class: intersection over union, and precision and recall with a slack of 2 px at 1280 px width,
 of the mask ``p > threshold``. The reliability says how often a stated probability was right.
 """
 

@@ -43,6 +43,14 @@ def stamp_text(stamp_ns: int) -> str:
     return f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 100_000} UTC"
 
 
+def span_text(from_ns: int, to_ns: int) -> str:
+    """Two stamps joined by 'and'; what they share of the date and the zone stands once."""
+    first, last = stamp_text(from_ns), stamp_text(to_ns)
+    day = first[: len("2000-01-01 ")]
+    shared = first.endswith(" UTC") and last.startswith(day)
+    return f"{first.removesuffix(' UTC')} and {last.removeprefix(day)}" if shared else f"{first} and {last}"
+
+
 def size_text(axis: AxisName, value: float | None, *, sign: bool = False) -> str:
     """A size with its unit (``0.52 deg``, ``+0.123 m``), or 'unknown'."""
     if value is None:
@@ -109,8 +117,7 @@ def _onset_text(status: Status) -> str:
     onset = status.onset
     if onset is None:
         return f"told since {stamp_text(status.since_ns)}"
-    earliest, latest = stamp_text(onset.from_ns), stamp_text(onset.to_ns)
-    return f"since {stamp_text(onset.stamp_ns)} (between {earliest} and {latest})"
+    return f"since {stamp_text(onset.stamp_ns)} (between {span_text(onset.from_ns, onset.to_ns)})"
 
 
 def _clause(sentence: str) -> str:

@@ -150,23 +150,41 @@ def _places(image: Pixels, stored: Floats, estimated: Floats, most: int) -> tupl
     height, width = image.shape[:2]
     w = max(1, width // _CROPS_ACROSS)
     h = max(1, min(height, round(w / _CROP_SHAPE)))
-    apart = np.linalg.norm(stored - estimated, axis=1)
     edges = _edge_strength(image)
     scored: list[tuple[float, Place]] = []
     for top in range(0, height - h + 1, max(1, h // 3)):
         for left in range(0, width - w + 1, max(1, w // 3)):
-            # Both ends of a displacement must be in the picture, or one of the two shows nothing.
-            inside = _within(stored, left, top, w, h) & _within(estimated, left, top, w, h)
-            number = int(inside.sum())
-            if number >= _FEWEST_POINTS:
-                place = Place(left, top, w, h, float(np.median(apart[inside])), number)
-                contrast = float(edges[top : top + h, left : left + w].mean())
-                scored.append((place.apart_px * min(number, _ENOUGH_POINTS) * contrast, place))
+            found = _place(stored, estimated, left, top, w, h)
+            if found is None:
+                continue
+            # Once more with its points in the middle.
+            inside = _inside(stored, estimated, left, top, w, h)
+            centre = np.median(0.5 * (stored + estimated)[inside], axis=0) - (0.5 * w, 0.5 * h)
+            x, y = (int(c) for c in np.clip(np.round(centre), 0, (width - w, height - h)))
+            place = _place(stored, estimated, x, y, w, h) or found
+            contrast = float(edges[place.top : place.top + h, place.left : place.left + w].mean())
+            scored.append((place.apart_px * min(place.points, _ENOUGH_POINTS) * contrast, place))
     chosen: list[Place] = []
     for _, place in sorted(scored, key=lambda item: item[0], reverse=True):
         if len(chosen) < most and not any(_overlap(place, other) for other in chosen):
             chosen.append(place)
     return tuple(chosen)
+
+
+def _place(stored: Floats, estimated: Floats, *window: int) -> Place | None:
+    """The place (left, top, width, height), or None where too few points are in it to judge by."""
+    inside = _inside(stored, estimated, *window)
+    number = int(inside.sum())
+    if number < _FEWEST_POINTS:
+        return None
+    apart = np.linalg.norm(stored[inside] - estimated[inside], axis=1)
+    left, top, width, height = window
+    return Place(left, top, width, height, float(np.median(apart)), number)
+
+
+def _inside(stored: Floats, estimated: Floats, *window: int) -> NDArray[np.bool_]:
+    """Both ends of a displacement must be in the picture, or one of the two shows nothing."""
+    return _within(stored, *window) & _within(estimated, *window)
 
 
 def _edge_strength(image: Pixels) -> NDArray[np.float32]:

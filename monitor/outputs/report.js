@@ -55,8 +55,9 @@
       const place = document.getElementById(axis.id);
       const low = axis.value.map((value, i) => (value === null ? null : value - 2 * axis.sigma[i]));
       const high = axis.value.map((value, i) => (value === null ? null : value + 2 * axis.sigma[i]));
-      const figure = (u, value) => (value === null || value === undefined ? "–" : value.toFixed(3));
-      const hidden = { width: 0, points: { show: false }, value: figure };
+      const told = (u, value, series, i) => (value === null || value === undefined || i === null ? "–"
+        : value.toFixed(3) + " ± " + axis.sigma[i].toFixed(3) + " " + axis.unit);
+      const hidden = { width: 0, points: { show: false } };
       const seen = axis.value.some((value) => value !== null);
       const plot = new uPlot({
         title: axis.name + " [" + axis.unit + "], limit ±" + axis.limit + (seen ? "" : ": not observable"),
@@ -67,7 +68,7 @@
           { size: 54, font: "11px sans-serif" }],
         series: [{ label: "s", value: (u, value) => (value === null ? "–" : value.toFixed(1)) },
           { ...hidden, label: "−2 sigma" }, { ...hidden, label: "+2 sigma" },
-          { label: axis.name, stroke: "#1668a8", width: 1.6, points: { show: false }, value: figure }],
+          { label: axis.name, stroke: "#1668a8", width: 1.6, points: { show: false }, value: told }],
         bands: [{ series: [2, 1], fill: "#1668a833" }],
         hooks: { drawClear: [(u) => background(u, pair, axis.limit)] },
       }, [pair.seconds, low, high, axis.value], place);

@@ -14,8 +14,9 @@ MAX_SIGMA = 2.0
 NULL_RATIO = 1e-9
 """Eigenvalue over the largest below which a direction has no information at all (FORMULAS D3)."""
 
-_NULL_SHARE = 1e-12
-"""Squared component of a null direction on an axis that is rounding, not a held part."""
+FARTHEST = 20.0
+"""Alert limits; no mount moves further (10 deg, 3 to 4 m), so a null direction is known at least so well. It
+keeps a null direction that leans on an axis by a hundredth from taking that axis away as well."""
 
 
 def in_vehicle_axes(xi: Floats, information: Floats, R_vehicle_cam: Floats) -> tuple[Floats, Floats]:
@@ -43,9 +44,9 @@ class Observability:
         sigmas: float64 (6,), standard deviation along each direction in alert limits, inf where null.
         directions: float64 (6,6), columns are unit vectors in alert limits, in the order of records.AXES.
         observed: bool (6,), directions whose sigma is at most ``MAX_SIGMA``; the others are held.
-        axis_sigmas: float64 (6,), standard deviation of each axis, rad and m; inf where a null direction
-            touches it.
-        axis_observed: bool (6,), axes whose own sigma is at most ``MAX_SIGMA`` alert limits.
+        axis_sigmas: float64 (6,), standard deviation of each axis, rad and m, directions counted as known
+            to ``FARTHEST``; inf where the axis is not observed for a null direction that leans on it.
+        axis_observed: bool (6,), axes whose sigma is at most ``MAX_SIGMA`` alert limits.
     """
 
     limits: Floats
@@ -79,17 +80,16 @@ def observable(information: Floats, limits: Floats) -> Observability:
     values, directions = np.linalg.eigh(information * np.outer(limits, limits))
     null = values <= NULL_RATIO * max(float(values[-1]), 0.0)
     variance = np.where(null, np.inf, 1.0 / np.where(null, 1.0, values))
-    share = directions**2
-    with_rounding = np.where(null[None, :] & (share < _NULL_SHARE), 0.0, share)
-    finite = np.where(null, 0.0, variance)
-    touched = (with_rounding[:, null] > 0).any(axis=1)
-    axis_sigmas = np.where(touched, np.inf, np.sqrt(share @ finite)) * limits
     sigmas = np.sqrt(variance)
+    share = directions**2
+    bounded = np.sqrt(share @ np.minimum(variance, FARTHEST**2))
+    leans = (share[:, null] * FARTHEST**2 > MAX_SIGMA**2).any(axis=1)
+    observed = bounded <= MAX_SIGMA
     return Observability(
         read_only(limits),
         read_only(sigmas),
         read_only(directions),
         read_only(sigmas <= MAX_SIGMA),
-        read_only(axis_sigmas),
-        read_only(axis_sigmas <= MAX_SIGMA * limits),
+        read_only(np.where(leans, np.inf, bounded) * limits),
+        read_only(observed),
     )

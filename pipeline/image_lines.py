@@ -1,0 +1,280 @@
+"""Centre lines of lane strokes and poles in the image, to a fraction of a pixel (FORMULAS E1).
+
+The masks say where a stroke is, the image itself where exactly: across the stroke two edges are sought near
+the borders of the mask, and their middle is a point of the line. Points are undistorted before the fit.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.cameras import ideal_pixels
+from pipeline.records import CameraImage, CameraModel, Floats, ImageLine, LineLabel, Masks
+
+REFERENCE_FOCAL_PX = 720.0
+"""px; lengths below are those of an image with this focal length and grow with it: they are angles."""
+BLUR_PX = 0.8
+"""px; takes the staircase from edges without moving them."""
+MIN_LENGTH_PX = 25.0
+"""px; shorter strokes have no direction: 0.5 px at each end are 1.6 deg."""
+HOUGH_GAP_PX = 6.0
+"""px; holes in a mask that do not end a stroke."""
+MIN_FRESH = 0.5
+"""Share of a Hough segment that no earlier line has claimed, at least."""
+STATION_PX = 1.5
+"""px along the line from one cross-section to the next; nearer ones share their pixels."""
+MAX_STATIONS = 200
+"""Cross-sections per stroke; more do not sharpen a line against its floor."""
+MAX_HALF_PROFILE_PX = 60.0
+"""px; a stroke twice as wide is nothing that lies or stands at a distance."""
+SAMPLE_PX = 0.5
+"""px; step across the stroke."""
+MIN_EDGE = 1.5
+"""Grey levels per px; weaker edges are noise of an 8-bit image after the blur."""
+EDGE_OVER_MEDIAN = 2.0
+"""An edge stands out of its own cross-section by this factor."""
+MIN_STATIONS = 8
+MIN_EDGES_SHARE = 0.4
+"""Share of cross-sections that show both edges, at least; below it the mask is not what it says."""
+TRIM_SIGMAS = 3.0
+MAX_RMS_PX = 1.5
+"""px; straight strokes scatter by 0.2 to 0.5 px."""
+MAX_SAG_PX = 0.75
+"""px; a stroke that bends further is split in two: its middle would pull the line by half of that."""
+INDEPENDENT_PX = 4.0
+"""px along the line between independent edge points: the mask's and the blur's correlation length."""
+FLOOR_PX = 0.3
+"""px; what no count of points averages away: paint borders, a pole's taper, the lens model (FORMULAS D4)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stroke:
+    """Sub-pixel centre points (N,2), ideal px, of one straight stroke and the line through them."""
+
+    points: Floats
+    mean: Floats
+    direction: Floats
+    rms: float
+
+    @property
+    def along(self) -> Floats:
+        return np.asarray((self.points - self.mean) @ self.direction)
+
+    @property
+    def length(self) -> float:
+        return float(np.ptp(self.along))
+
+
+def find_image_lines(image: CameraImage, masks: Masks, camera: CameraModel) -> list[ImageLine]:
+    """Straight centre lines of all lane strokes and poles.
+
+    Args:
+        image: The image, raw.
+        masks: Where lanes and poles are.
+        camera: Intrinsics of the raw image.
+
+    Returns:
+        Lines in ideal pixels; dashes of one lane line are one line.
+    """
+    unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
+    grey = cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), BLUR_PX * unit), dtype=np.float32)
+    lines = []
+    for label, mask in _labelled(masks):
+        strokes = []
+        for start, end, widths in _segments(mask, masks, unit):
+            centres = _centres(grey, label, (start, end), widths, unit)
+            ideal = ideal_pixels(camera, centres)
+            strokes += _straight(ideal[np.isfinite(ideal).all(axis=1)], unit)
+        lines += [_image_line(label, stroke, unit) for stroke in _merged(strokes, unit)]
+    return lines
+
+
+def _labelled(masks: Masks) -> tuple[tuple[LineLabel, NDArray[np.bool_]], ...]:
+    return ("lane", masks.lane), ("pole", masks.pole)
+
+
+def _segments(
+    mask: NDArray[np.bool_], masks: Masks, unit: float
+) -> list[tuple[Floats, Floats, tuple[float, float]]]:
+    """Straight pieces of a mask's ridge: two ends (2,) in image px and the stroke's widths there, px."""
+    # A border of background: strokes that the image cuts keep their width.
+    padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    depth = cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    ridge = ((depth > 0) & (depth >= cv2.dilate(depth, np.ones((3, 3))) - _TIE)).astype(np.uint8)
+    grid = min(masks.scale_x, masks.scale_y)
+    shortest = MIN_LENGTH_PX * unit * grid
+    found = cv2.HoughLinesP(
+        ridge, 1.0, math.radians(0.5), max(6, int(0.5 * shortest)), None, shortest, HOUGH_GAP_PX * unit * grid
+    )
+    if found is None:
+        return []
+    ends = found.reshape(-1, 2, 2).astype(np.float64)
+    ends = ends[np.argsort(-np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))]
+    claimed = np.zeros_like(ridge)
+    segments = []
+    scale = np.array([masks.scale_x, masks.scale_y])
+    for start, end in ends:
+        count = max(2, round(float(np.abs(end - start).max())) + 1)
+        column, row = np.rint(np.linspace(start, end, count)).astype(np.int64).T
+        if claimed[row, column].mean() > 1.0 - MIN_FRESH:
+            continue
+        # The ridge's depth is half the width plus the half pixel to the border's centre.
+        width = np.maximum(2.0 * depth[row, column] - 1.0, 1.0) / grid
+        half = max(1, count // 3)
+        widths = float(np.median(width[:half])), float(np.median(width[-half:]))
+        thickness = max(3, math.ceil(1.5 * max(widths) * grid))
+        cv2.line(claimed, _pixel(start), _pixel(end), 1, thickness)
+        segments.append(((start + 0.5) / scale - 0.5, (end + 0.5) / scale - 0.5, widths))
+    return segments
+
+
+_TIE = 1e-3
+"""px of depth within which two neighbours are both on the ridge."""
+
+
+def _pixel(point: Floats) -> tuple[int, int]:
+    return round(float(point[0])), round(float(point[1]))
+
+
+def _centres(
+    grey: NDArray[np.float32],
+    label: LineLabel,
+    segment: tuple[Floats, Floats],
+    widths: tuple[float, float],
+    unit: float,
+) -> Floats:
+    """Middles (M,2), raw px, between the two edges of a stroke at stations along it; empty for no edges."""
+    start, end = segment
+    length = float(np.linalg.norm(end - start))
+    count = int(min(MAX_STATIONS, max(2, length / STATION_PX)))
+    share = np.linspace(0.0, 1.0, count)
+    station = start + share[:, None] * (end - start)
+    width = widths[0] + share * (widths[1] - widths[0])
+    normal = np.array([start[1] - end[1], end[0] - start[0]]) / length
+    # The Hough line may lie askew in a wide stroke and the mask's border a grid px off the true one.
+    margin = 2.0 * unit + 0.4 * width
+    reach = min(MAX_HALF_PROFILE_PX * unit, float((0.5 * width + margin).max()) + 1.0)
+    offset = np.arange(-reach, reach + SAMPLE_PX / 2, SAMPLE_PX)
+    where = (station[:, None, :] + offset[None, :, None] * normal).astype(np.float32)
+    profile = cv2.remap(grey, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    slope = np.gradient(profile.astype(np.float64), SAMPLE_PX, axis=1)
+    floor = np.maximum(MIN_EDGE, EDGE_OVER_MEDIAN * np.median(np.abs(slope), axis=1))
+    edges = []
+    for side in (-1.0, 1.0):
+        window = np.abs(offset[None, :] - side * 0.5 * width[:, None]) <= margin[:, None]
+        # Each side stays on its own half, or both find the same edge of a thin stroke.
+        window &= side * offset[None, :] > -0.5 * margin[:, None]
+        signed = -side * slope
+        if label == "pole":
+            signed *= _polarity(signed, window)
+        edges.append(_peak(signed, window, offset, floor))
+    left, right = edges
+    both = np.isfinite(left) & np.isfinite(right)
+    both[both] &= right[both] - left[both] > SAMPLE_PX
+    if both.sum() < max(MIN_STATIONS, MIN_EDGES_SHARE * count):
+        return np.zeros((0, 2))
+    middle = 0.5 * (left[both] + right[both])
+    return np.asarray(station[both] + middle[:, None] * normal)
+
+
+def _polarity(signed: Floats, window: NDArray[np.bool_]) -> float:
+    """Whether a pole's edge rises or falls: the sign that most cross-sections agree on."""
+    inside = np.where(window, signed, 0.0)
+    return 1.0 if np.median(inside.max(axis=1) + inside.min(axis=1)) >= 0 else -1.0
+
+
+def _peak(signed: Floats, window: NDArray[np.bool_], offset: Floats, floor: Floats) -> Floats:
+    """Offset (M,) of each cross-section's strongest slope in its window, by a parabola; NaN for none."""
+    inside = np.where(window, signed, -np.inf)
+    best = inside.argmax(axis=1)
+    rows = np.arange(len(signed))
+    safe = np.clip(best, 1, signed.shape[1] - 2)
+    before, at, after = (signed[rows, safe + k] for k in (-1, 0, 1))
+    is_peak = (best == safe) & (at > floor) & (at >= before) & (at >= after)
+    bend = np.minimum(before - 2 * at + after, -1e-9)
+    shift = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+    return np.where(is_peak, offset[safe] + shift * SAMPLE_PX, np.nan)
+
+
+def _straight(points: Floats, unit: float) -> list[_Stroke]:
+    """Straight strokes through centre points (N,2), ideal px; a bent one is split until straight."""
+    stroke = _fit(points, unit)
+    if stroke is None or stroke.length < MIN_LENGTH_PX * unit:
+        return []
+    along = stroke.along
+    across = (stroke.points - stroke.mean) @ np.array([-stroke.direction[1], stroke.direction[0]])
+    half = 0.5 * float(np.ptp(along))
+    middle = 0.5 * float(along.min() + along.max())
+    bend = np.polynomial.polynomial.polyfit((along - middle) / half, across, 2)[2]
+    if abs(bend) > MAX_SAG_PX * unit:
+        position = (points - stroke.mean) @ stroke.direction
+        return _straight(points[position < middle], unit) + _straight(points[position >= middle], unit)
+    return [stroke] if stroke.rms <= MAX_RMS_PX * unit else []
+
+
+def _fit(points: Floats, unit: float) -> _Stroke | None:
+    """Total least squares with trimming; None for too few points."""
+    kept = np.ones(len(points), dtype=bool)
+    stroke = None
+    for _ in range(4):
+        if kept.sum() < MIN_STATIONS:
+            return None
+        mean = points[kept].mean(axis=0)
+        direction = np.linalg.svd(points[kept] - mean, full_matrices=False)[2][0]
+        across = np.abs((points - mean) @ np.array([-direction[1], direction[0]]))
+        rms = float(np.sqrt((across[kept] ** 2).mean()))
+        stroke = _Stroke(points[kept], mean, direction, rms)
+        scale = 1.48 * float(np.median(across[kept]))
+        kept = across <= TRIM_SIGMAS * max(scale, 0.1 * unit)
+    return stroke
+
+
+def _merged(strokes: list[_Stroke], unit: float) -> list[_Stroke]:
+    """Pieces of one line joined: dashes, and what a mask's hole or Hough's tolerance had split."""
+    waiting = sorted(strokes, key=lambda stroke: -stroke.length)
+    merged: list[_Stroke] = []
+    while waiting:
+        line = waiting.pop(0)
+        grown = True
+        while grown:
+            grown = False
+            for index, other in enumerate(waiting):
+                joint = _joint(line, other, unit)
+                if joint is not None:
+                    line, grown = joint, True
+                    del waiting[index]
+                    break
+        merged.append(line)
+    return merged
+
+
+def _joint(first: _Stroke, second: _Stroke, unit: float) -> _Stroke | None:
+    """Both strokes as one, where one straight line explains them as well as each is explained alone."""
+    points = np.concatenate([first.points, second.points])
+    mean = points.mean(axis=0)
+    direction = np.linalg.svd(points - mean, full_matrices=False)[2][0]
+    across = (points - mean) @ np.array([-direction[1], direction[0]])
+    offsets = [abs(float(part.mean())) for part in np.split(across, [len(first.points)])]
+    rms = float(np.sqrt((across**2).mean()))
+    apart = max(first.rms, second.rms, FLOOR_PX * unit)
+    joint = _Stroke(points, mean, direction, rms)
+    fits = rms <= 1.2 * apart and max(offsets) <= apart and len(_straight(points, unit)) == 1
+    return joint if fits else None
+
+
+def _image_line(label: LineLabel, stroke: _Stroke, unit: float) -> ImageLine:
+    """The stroke's ends and the sigma of its line there: twice the noise of a mean, and the floor."""
+    along = stroke.along
+    independent = max(2.0, min(len(along), stroke.length / (INDEPENDENT_PX * unit)))
+    # A line's end scatters twice as much as its middle (1/m + s^2/S with evenly spread points).
+    sigma = math.hypot(2.0 * stroke.rms / math.sqrt(independent), FLOOR_PX * unit)
+    return ImageLine(
+        label,
+        stroke.mean + float(along.min()) * stroke.direction,
+        stroke.mean + float(along.max()) * stroke.direction,
+        sigma,
+    )

@@ -1,4 +1,4 @@
-"""Rigid motions: exponential, logarithm, retraction, and the change from camera to vehicle axes (FORMULAS A)."""
+"""Rigid motions: exponential, logarithm, retraction, change from camera to vehicle axes (FORMULAS A)."""
 
 import math
 
@@ -8,6 +8,10 @@ from pipeline.records import Floats
 
 _SMALL_ANGLE = 1e-6
 """rad; below it the series of sin(x)/x is exact to rounding."""
+
+_NEAR_HALF_TURN = -0.9
+"""Cosine of the angle below which the axis is read from the symmetric part of a rotation: the antisymmetric
+part vanishes at 180 degrees, and an axis read from it drowns in rounding."""
 
 
 def skew(a: Floats) -> Floats:
@@ -30,14 +34,13 @@ def log_so3(R: Floats) -> Floats:
     sine = float(np.linalg.norm(vee))
     cosine = 0.5 * (float(np.trace(R)) - 1.0)
     angle = math.atan2(sine, cosine)
-    if sine > _SMALL_ANGLE:
-        return vee * (angle / sine)
-    if cosine > 0.0:
-        return vee
-    # Half a turn: the axis is the eigenvector of R + I with the largest column.
-    M = 0.5 * (R + np.eye(3))
+    if cosine > _NEAR_HALF_TURN:
+        return vee * (angle / sine) if sine > _SMALL_ANGLE else vee
+    # (R + R^T) / 2 = cos I + (1 - cos) a a^T; the sign of the axis a is that of the antisymmetric part.
+    M = 0.5 * (R + R.T) - cosine * np.eye(3)
     axis = M[:, int(np.argmax(np.diag(M)))]
-    return np.asarray(axis / np.linalg.norm(axis) * angle, dtype=np.float64)
+    sign = -1.0 if float(axis @ vee) < 0.0 else 1.0
+    return np.asarray(axis / np.linalg.norm(axis) * (sign * angle), dtype=np.float64)
 
 
 def rotation_angle(R1: Floats, R2: Floats) -> float:
@@ -99,10 +102,10 @@ def vehicle_axes(T_cam_lidar: Floats, T_vehicle_lidar: Floats | None) -> Floats:
 
 
 def mount_drift(T_stored: Floats, T_now: Floats, R_vehicle_cam: Floats) -> Floats:
-    """Motion of the camera mount since the extrinsic was stored, (6,): roll, pitch, yaw rad, forward, left, up m.
+    """Motion of the camera mount since the extrinsic was stored, (6,).
 
-    Angles are Euler ZYX of ``E_now E_ref^T`` (FORMULAS A5); the translation is that of the camera CENTRE.
-    ``R_vehicle_cam`` belongs to the stored extrinsic.
+    Roll, pitch, yaw in rad, then forward, left, up in m. Angles are Euler ZYX of ``E_now E_ref^T`` (FORMULAS
+    A5); the translation is that of the camera CENTRE. ``R_vehicle_cam`` belongs to the stored extrinsic.
     """
     # The mount's rotation in vehicle axes: dE = R_vc (R_ref R_now^T) R_vc^T.
     dE = R_vehicle_cam @ (T_stored[:3, :3] @ T_now[:3, :3].T) @ R_vehicle_cam.T
@@ -116,15 +119,9 @@ def mount_drift(T_stored: Floats, T_now: Floats, R_vehicle_cam: Floats) -> Float
 
 
 def displaced(T_cam_lidar: Floats, drift: Floats, R_vehicle_cam: Floats) -> Floats:
-    """The extrinsic after the mount moved by ``drift`` (6,) in vehicle axes: inverse of :func:`mount_drift`."""
-    roll, pitch, yaw = drift[:3]
-    cr, sr, cp, sp, cy, sy = *_cs(roll), *_cs(pitch), *_cs(yaw)
-    Rz = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    dE = Rz @ Ry @ Rx
+    """Extrinsic after the mount moved by ``drift`` (6,) in vehicle axes: inverse of :func:`mount_drift`."""
     R = T_cam_lidar[:3, :3]
-    R_now = R_vehicle_cam.T @ dE.T @ R_vehicle_cam @ R
+    R_now = R_vehicle_cam.T @ _turned(drift).T @ R_vehicle_cam @ R
     centre = -R.T @ T_cam_lidar[:3, 3] + R.T @ R_vehicle_cam.T @ drift[3:]
     return transform(R_now, -R_now @ centre)
 
@@ -132,18 +129,18 @@ def displaced(T_cam_lidar: Floats, drift: Floats, R_vehicle_cam: Floats) -> Floa
 def stored_before(T_true: Floats, drift: Floats, R_vehicle_lidar: Floats | None) -> Floats:
     """The stored extrinsic from which the mount moved by ``drift`` to ``T_true``: ``--inject`` (DESIGN 2).
 
-    ``R_vehicle_lidar`` (3,3) turns LiDAR axes into vehicle axes; None lets the stored camera's own axes stand in,
-    which are those of the extrinsic that is sought: solved by a fixed-point iteration that converges like the angle.
+    ``R_vehicle_lidar`` (3,3) turns LiDAR axes into vehicle axes; None lets the axes of the stored camera that
+    is sought stand in (:func:`vehicle_axes`).
     """
-    T_stored = T_true
-    for _ in range(30):
-        R_vc = AXES_CAM_IN_VEHICLE if R_vehicle_lidar is None else R_vehicle_lidar @ T_stored[:3, :3].T
-        reached = displaced(T_stored, drift, R_vc)
-        correction = local(reached, T_true)
-        T_stored = retract(T_stored, correction)
-        if float(np.abs(correction).max()) < 1e-14:
-            break
-    return T_stored
+    R_true, dE = T_true[:3, :3], _turned(drift)
+    if R_vehicle_lidar is None:
+        R_vc = AXES_CAM_IN_VEHICLE
+        R = R_vc.T @ dE @ R_vc @ R_true
+    else:
+        R = R_true @ R_vehicle_lidar.T @ dE @ R_vehicle_lidar
+        R_vc = R_vehicle_lidar @ R.T
+    centre = -R_true.T @ T_true[:3, 3] - R.T @ R_vc.T @ drift[3:]
+    return transform(R, -R @ centre)
 
 
 def vehicle_block(R_vehicle_cam: Floats) -> Floats:
@@ -151,6 +148,16 @@ def vehicle_block(R_vehicle_cam: Floats) -> Floats:
     B = np.zeros((6, 6))
     B[:3, :3] = B[3:, 3:] = -R_vehicle_cam
     return B
+
+
+def _turned(drift: Floats) -> Floats:
+    """Rotation dE of FORMULAS A5, (3,3): Rz(yaw) Ry(pitch) Rx(roll) of the first three of ``drift``."""
+    roll, pitch, yaw = drift[:3]
+    cr, sr, cp, sp, cy, sy = *_cs(roll), *_cs(pitch), *_cs(yaw)
+    Rz = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return np.asarray(Rz @ Ry @ Rx, dtype=np.float64)
 
 
 def _cs(angle: float) -> tuple[float, float]:

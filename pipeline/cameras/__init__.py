@@ -1,7 +1,8 @@
-"""Camera models, one file each: every module here offers ``MODEL`` (a :class:`LensModel`) under its message name.
+"""Camera models, one file each: every module here offers ``MODEL``, a :class:`LensModel`.
 
-All work on normalised coordinates ``x = X/Z, y = Y/Z``; :func:`project` and :func:`undistort` add K, the image's
-borders and the fold: beyond the radius where a polynomial lens stops growing nothing projects (FORMULAS E3).
+All work on normalised coordinates ``x = X/Z, y = Y/Z``; :func:`project` and :func:`undistort` add K, the
+borders of the image and the fold: beyond the radius where a polynomial lens stops growing nothing projects
+(FORMULAS E3).
 """
 
 import importlib
@@ -18,6 +19,9 @@ from pipeline.records import CameraModel, Floats
 NEAREST_DEPTH_M = 0.1
 """m; a point nearer to the image plane does not project (FORMULAS B (1))."""
 
+_HALF_PX = 0.5
+"""Pixel centres lie at integers, so the image ends half a pixel beyond the outermost."""
+
 
 class LensModel(Protocol):
     """What a camera model offers."""
@@ -29,7 +33,7 @@ class LensModel(Protocol):
         """Normalised coordinates (N,2) -> distorted normalised coordinates (N,2)."""
 
     def jacobian(self, xy: Floats, D: Floats) -> Floats:
-        """d distorted / d xy, (N,2,2)."""
+        """Derivative of distorted by undistorted coordinates, (N,2,2)."""
 
     def limit(self, D: Floats) -> float:
         """Largest ``hypot(x, y)`` for which the model is one to one; inf where there is none."""
@@ -55,6 +59,16 @@ def lens_of(camera: CameraModel) -> LensModel:
     return models[camera.model]
 
 
+def coefficients(D: Floats, count: int) -> tuple[float, ...]:
+    """First ``count`` distortion coefficients, 0 where D is shorter; InputError if more of them matter."""
+    if D[count:].any():
+        raise InputError(
+            f"distortion D {D.tolist()} has coefficients beyond the {count} that the camera model knows",
+            hint="calibrate without thin prism and tilt, or rectify the images",
+        )
+    return tuple(np.pad(D[:count], (0, max(0, count - len(D)))).tolist())
+
+
 def project(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Pixels of points in the camera frame.
 
@@ -63,15 +77,15 @@ def project(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np
         points_cam: float64 (N,3), metres, camera optical frame.
 
     Returns:
-        Pixels float64 (N,2), and bool (N,): in front of the camera, inside the lens model and inside the image.
-        Pixels of points behind the camera or beyond the fold are NaN.
+        Pixels float64 (N,2), and bool (N,): in front of the camera, inside the lens model and inside the
+        image. Pixels of points behind the camera or beyond the fold are NaN.
     """
     uv, valid = project_unbounded(camera, points_cam)
     inside = (
-        (uv[:, 0] >= -0.5)
-        & (uv[:, 0] < camera.width - 0.5)
-        & (uv[:, 1] >= -0.5)
-        & (uv[:, 1] < camera.height - 0.5)
+        (uv[:, 0] >= -_HALF_PX)
+        & (uv[:, 0] < camera.width - _HALF_PX)
+        & (uv[:, 1] >= -_HALF_PX)
+        & (uv[:, 1] < camera.height - _HALF_PX)
     )
     return uv, valid & inside
 
@@ -90,7 +104,7 @@ def project_unbounded(camera: CameraModel, points_cam: Floats) -> tuple[Floats, 
 
 
 def projection_jacobian(camera: CameraModel, points_cam: Floats) -> Floats:
-    """d pixel / d point in the camera frame, (N,2,3). The points must project."""
+    """Derivative of the pixel by the point in the camera frame, (N,2,3). The points must project."""
     z = points_cam[:, 2]
     xy = points_cam[:, :2] / z[:, None]
     J_lens = lens_of(camera).jacobian(xy, camera.D)
@@ -103,6 +117,12 @@ def projection_jacobian(camera: CameraModel, points_cam: Floats) -> Floats:
 _NEWTON_STEPS = 12
 """FORMULAS E3: eight steps reach 5e-13 px; four more for strong wide lenses."""
 
+_REACHED = 1e-6
+"""Normalised coordinates: a thousandth of a px at 1000 px focal length; what stays above was not reached."""
+
+_WITHIN = 0.999
+"""Share of the lens' limit up to which Newton's method may go: at the limit the Jacobian is singular."""
+
 
 def undistort(camera: CameraModel, uv: Floats) -> Floats:
     """Normalised coordinates (x, y at z = 1) of pixels (N,2), by Newton's method (FORMULAS E3).
@@ -111,23 +131,27 @@ def undistort(camera: CameraModel, uv: Floats) -> Floats:
     """
     lens = lens_of(camera)
     target = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    xy = target.copy()
-    limit = lens.limit(camera.D)
+    limit = _WITHIN * lens.limit(camera.D)
+    xy = _pulled_in(target, limit)
     for _ in range(_NEWTON_STEPS):
         residual = lens.distort(xy, camera.D) - target
         step = np.linalg.solve(lens.jacobian(xy, camera.D) + 1e-12 * np.eye(2), residual[..., None])[..., 0]
-        xy = xy - step
-        # A step must not leave the region in which the lens is one to one, or it converges to a folded ray.
-        radius = np.hypot(xy[:, 0], xy[:, 1])
-        outside = radius > 0.999 * limit if np.isfinite(limit) else np.zeros(len(xy), dtype=bool)
-        if outside.any():
-            xy[outside] *= (0.999 * limit / radius[outside])[:, None]
-    reached = np.hypot(*(lens.distort(xy, camera.D) - target).T) < 1e-6
+        xy = _pulled_in(xy - step, limit)
+    reached = np.hypot(*(lens.distort(xy, camera.D) - target).T) < _REACHED
     return np.where(reached[:, None], xy, np.nan)
 
 
+def _pulled_in(xy: Floats, limit: float) -> Floats:
+    """Coordinates (N,2) held within the radius in which the lens is one to one.
+
+    Beyond it Newton's method converges to folded rays.
+    """
+    radius = np.hypot(xy[:, 0], xy[:, 1])
+    return xy * np.minimum(1.0, limit / np.maximum(radius, np.finfo(np.float64).tiny))[:, None]
+
+
 def ideal_pixels(camera: CameraModel, uv: Floats) -> Floats:
-    """Pixels (N,2) of the raw image as a pinhole camera with the same K would see them; NaN beyond the lens."""
+    """Pixels (N,2) of the raw image as an ideal pinhole with the same K sees them; NaN beyond the lens."""
     return np.asarray(undistort(camera, uv) @ camera.K[:2, :2].T + camera.K[:2, 2], dtype=np.float64)
 
 

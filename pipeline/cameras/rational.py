@@ -2,7 +2,11 @@
 
 import numpy as np
 
+from pipeline.cameras import coefficients
 from pipeline.records import Floats
+
+_IMAGINARY = 1e-9
+"""Imaginary part below which a root is real."""
 
 
 class Rational:
@@ -12,7 +16,7 @@ class Rational:
 
     def distort(self, xy: Floats, D: Floats) -> Floats:
         """FORMULAS E2, plumb_bob and rational."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = _padded(D)
+        k1, k2, p1, p2, k3, k4, k5, k6 = coefficients(D, 8)
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -22,7 +26,7 @@ class Rational:
 
     def jacobian(self, xy: Floats, D: Floats) -> Floats:
         """Derivative of :meth:`distort`, (N,2,2)."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = _padded(D)
+        k1, k2, p1, p2, k3, k4, k5, k6 = coefficients(D, 8)
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -37,21 +41,15 @@ class Rational:
 
     def limit(self, D: Floats) -> float:
         """Radius where the distorted radius stops growing (tangential terms are too small to matter)."""
-        k1, k2, _, _, k3, k4, k5, k6 = _padded(D)
+        k1, k2, _, _, k3, k4, k5, k6 = coefficients(D, 8)
         top = np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3])
         bottom = np.polynomial.Polynomial([1, 0, k4, 0, k5, 0, k6])
         slope = top.deriv() * bottom - top * bottom.deriv()
-        candidates = [
-            root.real
-            for polynomial in (slope, bottom)
-            for root in polynomial.trim(1e-15).roots()
-            if abs(root.imag) < 1e-9 and root.real > 0
-        ]
-        return float(min(candidates, default=float("inf")))
-
-
-def _padded(D: Floats) -> tuple[float, ...]:
-    return tuple(np.pad(D[:8], (0, max(0, 8 - len(D)))).tolist())
+        roots = np.concatenate(
+            [np.asarray(p.trim(1e-15).roots(), dtype=np.complex128) for p in (slope, bottom)]
+        )
+        radii = roots.real[(np.abs(roots.imag) < _IMAGINARY) & (roots.real > 0.0)]
+        return float(radii.min(initial=float("inf")))
 
 
 MODEL = Rational()

@@ -1,0 +1,174 @@
+"""Is the stored extrinsic still true? Joint test of six axes, protection levels, what would have been noticed.
+
+Three kinds of error are kept apart (FORMULAS F, DESIGN 4): the random error of the window (its covariance), the
+systematic floor between scenes (measured on drives of one calibration, PROBE 3), and the stored extrinsic's own
+uncertainty. The last one widens the claim 'it moved', not the protection level.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.records import Floats, read_only
+
+
+@dataclass(frozen=True, slots=True)
+class DriftTestParameters:
+    """Thresholds of the test, each from a stated risk.
+
+    Attributes:
+        alarm: Joint statistic above which a window alone says 'moved': chi-square of 6 degrees of freedom at 1e-4.
+        suspicion: The same at 1e-3: more evidence is wanted.
+        noncentrality: Squared drift in sigma that exceeds ``alarm`` with probability 0.99 (6 degrees of freedom).
+        least_loss: Share of the best score that must be lost when the stored extrinsic may only move inside the
+            floor: half as much again as the largest of 300 healthy windows on four drives (PROBE 5).
+        suspicious_loss: Loss that is suspicious whatever the joint statistic says.
+        least_contrast: Score at the estimate over chance, minus 1, below which image and cloud show nothing in
+            common: three frames with nothing to say lay below 0.09, all others above 0.25 (PROBE 9).
+        K_fa: Two-sided quantile of a false alarm of 1e-5 per axis (FORMULAS F5).
+        K_md: One-sided quantile of a missed drift of 1e-3 (FORMULAS F5).
+        most_sigma: An axis is observable while its sigma is at most so many alert limits (DESIGN 4).
+        floor_roll: Systematic floor of roll between scenes, rad.
+        floor_bearing: Floor of the bearing up and down, and across, at ``bearing_range``, rad: what is sure.
+        floor_m: Floor of forward, left, up, m.
+        bearing_range: Range at which pitch and up, yaw and left make one bearing, m (PROBE 3).
+        bound_rad: Bound of the systematic error of one angle between scenes, rad.
+        bound_m: Bound of the systematic error of one shift between scenes, m.
+    """
+
+    alarm: float = 27.86
+    suspicion: float = 22.46
+    noncentrality: float = 51.8
+    least_loss: float = 0.03
+    suspicious_loss: float = 0.10
+    least_contrast: float = 0.15
+    K_fa: float = 4.417
+    K_md: float = 3.090
+    most_sigma: float = 2.0
+    floor_roll: float = math.radians(0.06)
+    floor_bearing: float = math.radians(0.04)
+    floor_m: tuple[float, float, float] = (0.03, 0.04, 0.03)
+    bearing_range: float = 20.0
+    bound_rad: float = math.radians(0.13)
+    bound_m: float = 0.04
+
+    def floor(self) -> Floats:
+        """Structured floor Qz, float64 (6,6), vehicle axes: ``A^-1 diag^2 A^-T`` (PROBE 3)."""
+        A = np.eye(6)
+        A[1, 5] = -1.0 / self.bearing_range
+        A[2, 4] = 1.0 / self.bearing_range
+        sigma = np.array([self.floor_roll, self.floor_bearing, self.floor_bearing, *self.floor_m])
+        inverse = np.linalg.inv(A)
+        return np.asarray(inverse @ np.diag(sigma**2) @ inverse.T, dtype=np.float64)
+
+    def bound(self) -> Floats:
+        """Bound b_j of the systematic error per axis, float64 (6,), rad and m (FORMULAS F5)."""
+        return np.array([self.bound_rad] * 3 + [self.bound_m] * 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a window says, in vehicle axes.
+
+    Attributes:
+        drift: float64 (6,), motion of the mount since the extrinsic was stored, rad and m.
+        covariance: float64 (6,6), of its random error.
+        loss: Share of the best score lost when only the floor may explain it (0 where no score exists).
+        contrast: Score at the estimate over chance, minus 1.
+        persistent: Whether each part of the window by itself prefers the estimate.
+        frames: Frames in the window.
+        contradicted: Whether the two witnesses differ by more than their errors allow.
+    """
+
+    drift: Floats
+    covariance: Floats
+    loss: float
+    contrast: float
+    persistent: bool
+    frames: int
+    contradicted: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """The test's result for one window. Arrays are float64 or bool (6,), in the order of ``records.AXES``.
+
+    Attributes:
+        drift: Estimate, rad and m.
+        sigma: Its random error.
+        protection_level: No drift beyond it is missed at the stated risk (FORMULAS F5).
+        detectable: Smallest drift of this axis alone that the joint test would have noticed.
+        observable: Sigma at most ``most_sigma`` alert limits.
+        monitored: Protection level at or below the alert limit.
+        excluded: Drift beyond the alert limit is excluded: ``|d| + K_md sigma + b <= limit``.
+        statistic: Joint statistic T, chi-square of six degrees of freedom without drift.
+        alarming: The window by itself says 'moved'.
+        suspicious: More evidence is wanted.
+        blind: Image and cloud show nothing in common.
+        contradicted: The witnesses contradict each other: nothing is claimed.
+    """
+
+    drift: Floats
+    sigma: Floats
+    protection_level: Floats
+    detectable: Floats
+    observable: NDArray[np.bool_]
+    monitored: NDArray[np.bool_]
+    excluded: NDArray[np.bool_]
+    statistic: float
+    alarming: bool
+    suspicious: bool
+    blind: bool
+    contradicted: bool
+
+    def __post_init__(self) -> None:
+        for name in (
+            "drift",
+            "sigma",
+            "protection_level",
+            "detectable",
+            "observable",
+            "monitored",
+            "excluded",
+        ):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+
+def stored_covariance(sigma_rad: float, sigma_m: float) -> Floats:
+    """C_ref (6,6) of an extrinsic known to ``sigma_rad`` and ``sigma_m`` per axis (FORMULAS F2)."""
+    return np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+
+
+def judge(evidence: Evidence, C_ref: Floats, limits: Floats, parameters: DriftTestParameters) -> Judgement:
+    """Tests the stored extrinsic against the evidence of one window (FORMULAS F2, F5).
+
+    Args:
+        evidence: Estimate and its error, vehicle axes.
+        C_ref: float64 (6,6), covariance of the stored extrinsic.
+        limits: float64 (6,), alert limits, rad and m.
+        parameters: Thresholds.
+    """
+    sigma = np.sqrt(np.diag(evidence.covariance))
+    P = evidence.covariance + parameters.floor() + C_ref
+    P_inverse = np.linalg.inv(P)
+    statistic = float(evidence.drift @ P_inverse @ evidence.drift)
+    bound = parameters.bound()
+    protection = (parameters.K_fa + parameters.K_md) * sigma + bound
+    seen = evidence.contrast >= parameters.least_contrast
+    convincing = evidence.loss > parameters.least_loss and evidence.persistent and seen
+    return Judgement(
+        drift=evidence.drift,
+        sigma=sigma,
+        protection_level=protection,
+        detectable=np.sqrt(parameters.noncentrality / np.diag(P_inverse)),
+        observable=seen & (sigma <= parameters.most_sigma * limits),
+        monitored=seen & (protection <= limits),
+        excluded=np.abs(evidence.drift) + parameters.K_md * sigma + bound <= limits,
+        statistic=statistic,
+        alarming=statistic > parameters.alarm and convincing and not evidence.contradicted,
+        suspicious=seen and (statistic > parameters.suspicion or evidence.loss > parameters.suspicious_loss),
+        blind=not seen,
+        contradicted=evidence.contradicted,
+    )

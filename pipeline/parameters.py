@@ -1,0 +1,36 @@
+"""Every setting of the algorithms in one tree; each stage describes its own, with unit and reason."""
+
+from dataclasses import dataclass, field
+
+from pipeline.drift_test import DriftTestParameters
+from pipeline.edge_witness import EdgeWitnessParameters
+from pipeline.edges import EdgeParameters
+from pipeline.masks import MaskParameters
+from pipeline.verdict import VerdictParameters
+from pipeline.window import WindowParameters
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Settings of one pair's pipeline.
+
+    Attributes:
+        edges: What counts as an edge of the cloud.
+        edge_witness: How edges are compared with the image.
+        masks: How the network's probabilities become masks.
+        lines_every_ns: Time between frames that get masks and lines: the network takes 0.1 s of two cores, and
+            lines of neighbouring frames are the same lines.
+        window: Which frames stay, and when they are judged.
+        test: Thresholds of the drift test.
+        verdict: Hysteresis and patience.
+        seed: Of the random numbers that RANSAC and the contrast draw.
+    """
+
+    edges: EdgeParameters = field(default_factory=EdgeParameters)
+    edge_witness: EdgeWitnessParameters = field(default_factory=EdgeWitnessParameters)
+    masks: MaskParameters = field(default_factory=MaskParameters)
+    lines_every_ns: int = 500_000_000
+    window: WindowParameters = field(default_factory=WindowParameters)
+    test: DriftTestParameters = field(default_factory=DriftTestParameters)
+    verdict: VerdictParameters = field(default_factory=VerdictParameters)
+    seed: int = 20_260

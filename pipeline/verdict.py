@@ -1,0 +1,290 @@
+"""The state machine: (memory, judgement, now) -> memory (DESIGN 4). Stamps are the data's; no clock in here."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from pipeline.drift_test import Judgement
+from pipeline.records import AXES, Floats
+
+State: TypeAlias = Literal["starting", "healthy", "suspect", "drifted", "unobservable", "stale", "fault"]
+
+CODES = {
+    "collecting": "starting",
+    "within_limits": "healthy",
+    "evidence_of_drift": "suspect",
+    "within_stored_uncertainty": "suspect",
+    "witnesses_disagree": "suspect",
+    "drift_confirmed": "drifted",
+    "too_short": "unobservable",
+    "axes_not_monitored": "unobservable",
+    "nothing_in_common": "unobservable",
+    "no_scan_pattern": "unobservable",
+    "no_pairs": "unobservable",
+    "no_input": "stale",
+    "cannot_work": "fault",
+}
+"""The closed list of reasons, each with the state it belongs to."""
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictParameters:
+    """Hysteresis and patience.
+
+    Attributes:
+        confirmations: Alarming judgements in a row, with estimates that agree, before 'drifted'.
+        agreement_sigma: Estimates agree when they differ by at most so many sigma on every axis.
+        patience_ns: A required axis may go unmonitored so long before 'unobservable' (DESIGN 10: a first verdict
+            takes at most 10 s).
+        silence_ns: No pair for so long is 'stale' (DESIGN 4).
+    """
+
+    confirmations: int = 3
+    agreement_sigma: float = 2.0
+    patience_ns: int = 10_000_000_000
+    silence_ns: int = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Onset:
+    """When a drift began: most likely stamp, and the interval that holds it, ns."""
+
+    stamp_ns: int
+    from_ns: int
+    to_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Memory:
+    """What the machine knows between judgements.
+
+    Attributes:
+        state: Present state.
+        code: Reason out of ``CODES``.
+        reason: One sentence.
+        since_ns: Stamp of the data at which the state was entered.
+        onset: When the drift began, or None.
+        severity: Of a drift, or None.
+        alarms: Alarming judgements in a row that agree.
+        alarm_drift: Estimate (6,) of the last of them, or None.
+        quiet_ns: Stamp of the last judgement without suspicion (at first: of the first data).
+        monitored_ns: Stamp at which every required axis was last monitored (at first: of the first data).
+        last_seen_ns: Per axis the stamp at which it was last observable, or None.
+        input_ns: Stamp of the last pair.
+    """
+
+    state: State
+    code: str
+    reason: str
+    since_ns: int
+    onset: Onset | None
+    severity: Literal["minor", "major"] | None
+    alarms: int
+    alarm_drift: Floats | None
+    quiet_ns: int
+    monitored_ns: int
+    last_seen_ns: tuple[int | None, ...]
+    input_ns: int
+
+
+def start(now_ns: int) -> Memory:
+    """The memory before any evidence."""
+    return Memory(
+        state="starting",
+        code="collecting",
+        reason="Evidence is being collected.",
+        since_ns=now_ns,
+        onset=None,
+        severity=None,
+        alarms=0,
+        alarm_drift=None,
+        quiet_ns=now_ns,
+        monitored_ns=now_ns,
+        last_seen_ns=(None,) * len(AXES),
+        input_ns=now_ns,
+    )
+
+
+def paired(memory: Memory, now_ns: int) -> Memory:
+    """A pair came in: a stale state ends, with its evidence to be collected anew."""
+    memory = dataclasses.replace(memory, input_ns=now_ns)
+    if memory.state != "stale":
+        return memory
+    fresh = dataclasses.replace(memory, quiet_ns=now_ns, monitored_ns=now_ns, alarms=0, alarm_drift=None)
+    if memory.severity is not None:
+        return _enter(fresh, "drift_confirmed", "The drift told before the inputs stopped stands.", now_ns)
+    return _enter(fresh, "collecting", "Inputs are back; evidence is being collected.", now_ns)
+
+
+def silent(memory: Memory, now_ns: int, parameters: VerdictParameters) -> Memory:
+    """Nothing came until ``now_ns``: after ``silence_ns`` the state is stale."""
+    if memory.state in ("stale", "fault") or now_ns - memory.input_ns < parameters.silence_ns:
+        return memory
+    seconds = parameters.silence_ns / 1e9
+    return _enter(memory, "no_input", f"No pair of sweep and image for {seconds:.0f} s.", now_ns)
+
+
+def faulted(memory: Memory, reason: str, now_ns: int) -> Memory:
+    """Cannot work, for the reason given."""
+    return memory if memory.reason == reason else _enter(memory, "cannot_work", reason, now_ns)
+
+
+def advance(
+    memory: Memory,
+    judgement: Judgement,
+    now_ns: int,
+    required: tuple[str, ...],
+    limits: Floats,
+    parameters: VerdictParameters,
+) -> Memory:
+    """The state after one more judgement.
+
+    Args:
+        memory: Before it.
+        judgement: Of the window that ends now.
+        now_ns: Stamp of the window's newest frame.
+        required: Axes that must be monitored for 'healthy'.
+        limits: float64 (6,), alert limits.
+        parameters: Hysteresis and patience.
+    """
+    memory = _remembered(memory, judgement, now_ns, required, parameters)
+    if memory.severity is not None:
+        # Latched: only a new extrinsic or an acknowledgement ends a drift, whatever is seen later.
+        return dataclasses.replace(memory, severity=_worse(memory.severity, _severity(judgement, limits)))
+    if memory.alarms >= parameters.confirmations:
+        onset = Onset((memory.quiet_ns + now_ns) // 2, memory.quiet_ns, now_ns)
+        memory = dataclasses.replace(memory, onset=onset, severity=_severity(judgement, limits))
+        return _enter(memory, "drift_confirmed", _drift_reason(judgement, limits), now_ns)
+    if judgement.contradicted:
+        reason = "Lines and edges contradict each other beyond their errors: nothing is claimed of the mount."
+        return _enter(memory, "witnesses_disagree", reason, now_ns)
+    if judgement.suspicious or judgement.alarming:
+        reason = f"Evidence of drift is not yet sure: {_size(judgement, _worst(judgement, limits))}."
+        return _enter(memory, "evidence_of_drift", reason, now_ns)
+    return _quiet(memory, judgement, now_ns, required, parameters)
+
+
+def _quiet(
+    memory: Memory,
+    judgement: Judgement,
+    now_ns: int,
+    required: tuple[str, ...],
+    parameters: VerdictParameters,
+) -> Memory:
+    """The state after a judgement without suspicion."""
+    wanted = [AXES.index(axis) for axis in required]
+    patient = now_ns - memory.monitored_ns < parameters.patience_ns
+    if judgement.blind:
+        reason = (
+            "Image and cloud show nothing in common here (dark, blocked, or off by more than can be seen)."
+        )
+        keep = patient and memory.state in ("starting", "healthy")
+        return memory if keep else _enter(memory, "nothing_in_common", reason, now_ns)
+    monitored = [axis for axis in wanted if judgement.monitored[axis]]
+    if len(monitored) < len(wanted) or not wanted:
+        reason = _unmonitored_reason(judgement, [a for a in wanted if a not in monitored])
+        keep = patient and memory.state in ("starting", "healthy")
+        return memory if keep else _enter(memory, "axes_not_monitored", reason, now_ns)
+    doubtful = [axis for axis in wanted if not judgement.excluded[axis]]
+    if doubtful:
+        names = " and ".join(_size(judgement, axis) for axis in doubtful)
+        reason = f"{names} lies within the stored extrinsic's own uncertainty: learn a baseline."
+        return _enter(memory, "within_stored_uncertainty", reason, now_ns)
+    named = ", ".join(AXES[a] for a in range(len(AXES)) if judgement.monitored[a] and judgement.excluded[a])
+    return _enter(memory, "within_limits", f"Drift beyond the alert limits is excluded in {named}.", now_ns)
+
+
+def acknowledge(memory: Memory, now_ns: int) -> Memory:
+    """A person has taken note of a drift: the latch opens and evidence is collected anew."""
+    opened = dataclasses.replace(
+        memory, severity=None, onset=None, alarms=0, alarm_drift=None, quiet_ns=now_ns, monitored_ns=now_ns
+    )
+    return _enter(opened, "collecting", "The drift was acknowledged; evidence is being collected.", now_ns)
+
+
+def finish(memory: Memory, judgement: Judgement | None, frames: int, required: tuple[str, ...]) -> Memory:
+    """The state at the end of a recording: one that is still starting says why it can say nothing (DESIGN 4)."""
+    if memory.state != "starting":
+        return memory
+    now_ns = memory.input_ns
+    if frames == 0:
+        return _enter(memory, "no_pairs", "No pair of sweep and image could be used.", now_ns)
+    if judgement is None:
+        reason = "The clouds show no rings, so no edges could be compared with the image."
+        return _enter(memory, "no_scan_pattern", reason, now_ns)
+    few = f"{frames} frame{'s' if frames != 1 else ''} are too few for a verdict"
+    if judgement.blind:
+        return _enter(memory, "nothing_in_common", "Image and cloud show nothing in common.", now_ns)
+    missing = [AXES.index(axis) for axis in required if not judgement.monitored[AXES.index(axis)]]
+    detail = _unmonitored_reason(judgement, missing) if missing else "no judgement was repeated often enough."
+    return _enter(memory, "too_short", f"Too short: {few}; {detail}", now_ns)
+
+
+def _remembered(
+    memory: Memory,
+    judgement: Judgement,
+    now_ns: int,
+    required: tuple[str, ...],
+    parameters: VerdictParameters,
+) -> Memory:
+    """Counts of alarms and last sightings brought up to date."""
+    agree = memory.alarm_drift is None or bool(
+        np.all(
+            np.abs(judgement.drift - memory.alarm_drift)
+            <= parameters.agreement_sigma * np.sqrt(2.0) * judgement.sigma
+        )
+    )
+    alarms = (memory.alarms + 1 if agree else 1) if judgement.alarming else 0
+    calm = not (judgement.alarming or judgement.suspicious or judgement.contradicted)
+    all_monitored = all(judgement.monitored[AXES.index(axis)] for axis in required)
+    seen = tuple(
+        now_ns if judgement.observable[axis] else memory.last_seen_ns[axis] for axis in range(len(AXES))
+    )
+    return dataclasses.replace(
+        memory,
+        alarms=alarms,
+        alarm_drift=judgement.drift if judgement.alarming else None,
+        quiet_ns=now_ns if calm and not judgement.blind else memory.quiet_ns,
+        monitored_ns=now_ns if all_monitored else memory.monitored_ns,
+        last_seen_ns=seen,
+    )
+
+
+def _enter(memory: Memory, code: str, reason: str, now_ns: int) -> Memory:
+    state: State = CODES[code]  # type: ignore[assignment]  # values of CODES are states, a test holds it
+    since = memory.since_ns if state == memory.state else now_ns
+    return dataclasses.replace(memory, state=state, code=code, reason=reason, since_ns=since)
+
+
+def _severity(judgement: Judgement, limits: Floats) -> Literal["minor", "major"]:
+    return "major" if bool(np.any(np.abs(judgement.drift) > limits)) else "minor"
+
+
+def _worse(a: Literal["minor", "major"], b: Literal["minor", "major"]) -> Literal["minor", "major"]:
+    return "major" if "major" in (a, b) else "minor"
+
+
+def _worst(judgement: Judgement, limits: Floats) -> int:
+    return int(np.argmax(np.abs(judgement.drift) / limits))
+
+
+def _size(judgement: Judgement, axis: int) -> str:
+    value, sigma = float(judgement.drift[axis]), float(judgement.sigma[axis])
+    if axis < 3:
+        return f"{AXES[axis]} {np.degrees(value):+.2f} deg (sigma {np.degrees(sigma):.2f})"
+    return f"{AXES[axis]} {value:+.3f} m (sigma {sigma:.3f})"
+
+
+def _drift_reason(judgement: Judgement, limits: Floats) -> str:
+    return f"The mount has moved: {_size(judgement, _worst(judgement, limits))}."
+
+
+def _unmonitored_reason(judgement: Judgement, axes: list[int]) -> str:
+    parts = []
+    for axis in axes:
+        level = float(judgement.protection_level[axis])
+        text = f"{np.degrees(level):.2f} deg" if axis < 3 else f"{level:.3f} m"
+        parts.append(f"{AXES[axis]} is known to {text} only")
+    return f"{' and '.join(parts)}, more than its alert limit." if parts else "No axis is required."

@@ -135,7 +135,10 @@ class Scene:
         """All solids as they stand at ``time`` s, the standing ones first."""
         solids = self.standing
         for mover in self.movers:
-            place, heading, grade = self.surface.pose(mover.arc + mover.speed * time, mover.left)
+            arc = mover.arc + mover.speed * time
+            if not self.surface.arc[0] < arc < self.surface.arc[-1]:
+                continue
+            place, heading, grade = self.surface.pose(arc, mover.left)
             turn = float(heading) + (math.pi if mover.speed < 0 else 0.0)
             T = np.eye(4)
             T[:3, :3] = upright(turn, (-math.atan(float(grade) * math.cos(turn)), 0.0))

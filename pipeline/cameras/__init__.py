@@ -132,13 +132,30 @@ def undistort(camera: CameraModel, uv: Floats) -> Floats:
     lens = lens_of(camera)
     target = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
     limit = _WITHIN * lens.limit(camera.D)
-    xy = _pulled_in(target, limit)
+    xy = _first_guess(lens, camera.D, target, limit)
     for _ in range(_NEWTON_STEPS):
         residual = lens.distort(xy, camera.D) - target
         step = np.linalg.solve(lens.jacobian(xy, camera.D) + 1e-12 * np.eye(2), residual[..., None])[..., 0]
         xy = _pulled_in(xy - step, limit)
     reached = np.hypot(*(lens.distort(xy, camera.D) - target).T) < _REACHED
     return np.where(reached[:, None], xy, np.nan)
+
+
+_TABLE_SIZE = 512
+"""Radii at which the lens is tabulated: steps of a sixth of a degree, from which Newton's method converges."""
+
+
+def _first_guess(lens: LensModel, D: Floats, target: Floats, limit: float) -> Floats:
+    """Undistorted coordinates (N,2) by a table of the radius along one direction.
+
+    From the distorted coordinates themselves Newton's method oscillates where a lens first stretches, then
+    folds, and creeps where a fisheye nears 90 degrees.
+    """
+    radii = np.tan(np.linspace(0.0, _WITHIN * np.arctan(limit), _TABLE_SIZE))
+    distorted = np.hypot(*lens.distort(np.column_stack([radii, np.zeros(_TABLE_SIZE)]), D).T)
+    wanted = np.hypot(target[:, 0], target[:, 1])
+    found = np.interp(wanted, np.maximum.accumulate(distorted), radii)
+    return target * (found / np.maximum(wanted, np.finfo(np.float64).tiny))[:, None]
 
 
 def _pulled_in(xy: Floats, limit: float) -> Floats:

@@ -182,7 +182,7 @@ class TestSigns:
 
     @staticmethod
     def moved(axis, R_cam_vehicle, point_vehicle, R_vehicle_lidar):
-        """Where a point (vehicle axes, from the camera) appears before and after 0.1 of drift: direction (2,3)."""
+        """A point (vehicle axes, from the camera) in camera axes, before and after 0.1 of drift, (2,3)."""
         T = se3.transform(R_cam_vehicle @ R_vehicle_lidar, np.zeros(3))
         drift = np.zeros(6)
         drift[AXES.index(axis)] = 0.1

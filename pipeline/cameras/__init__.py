@@ -142,7 +142,7 @@ def undistort(camera: CameraModel, uv: Floats) -> Floats:
 
 
 _TABLE_SIZE = 512
-"""Radii at which the lens is tabulated: steps of a sixth of a degree, from which Newton's method converges."""
+"""Radii at which the lens is tabulated: a sixth of a degree apart, from which Newton's method converges."""
 
 
 def _first_guess(lens: LensModel, D: Floats, target: Floats, limit: float) -> Floats:

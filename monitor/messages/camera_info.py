@@ -83,7 +83,7 @@ def rectified_model(P: Floats, size: tuple[int, int]) -> CameraModel | None:
     return CameraModel("pinhole", np.array(P[:, :3], np.float64), np.empty(0), *size) if np.any(P) else None
 
 
-def encode(camera: CameraModel, stamp_ns: int, frame: str) -> bytes:
+def encode_camera_info(camera: CameraModel, stamp_ns: int, frame: str) -> bytes:
     """A CameraInfo in CDR: ``camera`` for raw images and, where it is a pinhole, for rectified ones too.
 
     Args:

@@ -16,6 +16,10 @@ from pipeline.records import CameraImage
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 RAW = "sensor_msgs/msg/Image"
 
+_MOST_PIXELS_PER_BYTE = {0x89: 8 * 1032, 0xFF: 512, 0x42: 128}
+"""By the first byte. PNG: deflate expands at most 1032 times, a pixel has at least one bit. JPEG: a block of
+64 px has at least one bit. BMP: a run of 255 px has two bytes."""
+
 _JPEG_STANDALONE = frozenset((0x01, *range(0xD0, 0xD8)))
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
@@ -60,7 +64,13 @@ def picture(data: memoryview) -> CameraImage:
     Raises:
         InputError: Another format, too large, damaged or cut short.
     """
-    check_size(*picture_size(data))
+    width, height = picture_size(data)
+    check_size(width, height)
+    if width * height > _MOST_PIXELS_PER_BYTE[data[0]] * len(data):
+        raise InputError(
+            f"a picture of {len(data)} bytes declares {width}x{height} px",
+            hint="it is damaged or was cut short",
+        )
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
@@ -115,7 +125,7 @@ def _jpeg_size(data: memoryview) -> tuple[int, int]:
     raise InputError(f"the JPEG tells no size in its first {_MOST_JPEG_SEGMENTS} segments")
 
 
-def encode_compressed(
+def encode_compressed_image(
     image: CameraImage, stamp_ns: int, frame: str, form: Literal["jpeg", "png"] = "jpeg"
 ) -> bytes:
     """A CompressedImage in CDR.

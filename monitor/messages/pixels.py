@@ -93,7 +93,7 @@ def bgr_pixels(data: NDArray[np.uint8], raster: Raster) -> NDArray[np.uint8]:
             f"image encoding '{raster.encoding}' is not understood",
             hint=f"understood: {', '.join(sorted({*_LAYOUTS, *_PLANAR}))}",
         )
-    if encoding.startswith(("yuv", "uyvy")) and raster.width % 2:
+    if layout.channels == 2 and raster.width % 2:
         raise InputError(f"image encoding '{raster.encoding}' with an odd width of {raster.width} px")
     if encoding.startswith("bayer") and min(raster.width, raster.height) < 2:
         raise InputError(f"a Bayer pattern needs 2x2 px, the image has {raster.width}x{raster.height}")

@@ -31,7 +31,7 @@ def decode(message: Message) -> tuple[Decoded, ...]:
     return (Decoded(stamp_ns, ros.frame_name(msg.header.frame_id), cloud_of(columns, stamp_ns)),)
 
 
-def encode(cloud: PointCloud, stamp_ns: int, frame: str) -> bytes:
+def encode_point_cloud2(cloud: PointCloud, stamp_ns: int, frame: str) -> bytes:
     """A PointCloud2 in CDR with the fields that the cloud has.
 
     Args:

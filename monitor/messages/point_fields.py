@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from monitor.messages import Codec
 from pipeline.errors import InputError
-from pipeline.records import PointCloud
+from pipeline.records import Floats, PointCloud
 
 CODECS: dict[str, Codec] = {}
 """This module is shared by those of the point clouds and decodes no type by itself."""
@@ -39,14 +39,16 @@ QUANTILE = 0.999
 """Share of points that may lie beyond the nominal intensity scale: retroreflectors and glitches."""
 
 LONGEST_SWEEP_S = 2.0
-"""s; spinning sensors take 0.05 to 0.2 s, slow scanners up to 1 s. A span beyond it is read in a finer unit,
-or not."""
+"""s; spinning sensors take 0.05 to 0.2 s, slow scanners up to 1 s."""
+
+COARSEST_S = 1e-3
+"""s; a hundredth of a sweep: absolute seconds in float32 step by 128 s."""
 
 _CLOCKS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6), (10**8, 10**9))
 """Least value and ns per unit of clocks counted from 1970 in ns, us, ms, s: dates from 1973 to 5138."""
 
 _UPTIME = {True: 10**8, False: 10**11}
-"""Values of floats (True) and integers below it count from the sweep or the sensor's start, never from 1970."""
+"""Floats (True) and integers below it count from the sweep or the sensor's start, never from 1970."""
 
 
 class Field(NamedTuple):
@@ -194,12 +196,12 @@ def _whole(values: Column) -> NDArray[np.uint16] | None:
 def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
     """Times of points in seconds after the stamp of the sweep, or None where they tell nothing.
 
-    The unit is the first of these in which the points span at most :data:`LONGEST_SWEEP_S`: that of a clock counted
-    from 1970, by the size of the numbers (s, ms, us or ns); ns for integers; s, ms, us, ns for floats. Clocks
-    from 1970 are told relative to ``stamp_ns``, others count from it. Where that puts the first point further from
-    the stamp than a sweep lasts, the clock is another one (another epoch, the sensor's uptime) and times count from
-    the earliest point. Times that are all equal (a converter's filler), not finite, or that make no sweep in any
-    unit say nothing.
+    The unit is the first of these in which the points span at most :data:`LONGEST_SWEEP_S`: that of a clock
+    counted from 1970, by the size of the numbers (s, ms, us or ns); ns for integers; s, ms, us, ns for
+    floats. Clocks from 1970 are told relative to ``stamp_ns``, others count from it. Where that puts the
+    first point further from the stamp than a sweep lasts, the clock is another one (another epoch, the sensor's
+    uptime) and times count from the earliest point. Times that are all equal (a converter's filler), not
+    finite, coarser than :data:`COARSEST_S`, or that make no sweep in any unit say nothing.
 
     Args:
         values: (N,), any integer or float type.
@@ -216,13 +218,14 @@ def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
     since_1970 = next((ns for least, ns in _CLOCKS if low >= least), None) if low >= _UPTIME[real] else None
     units = (*(() if since_1970 is None else (since_1970,)), *((10**9, 10**6, 10**3, 1) if real else (1,)))
     unit = next((ns for ns in units if (high - low) * ns <= LONGEST_SWEEP_S * 1e9), None)
-    if unit is None:
+    if unit is None or (real and float(np.spacing(values.max())) * unit > COARSEST_S * 1e9):
         return None
     origin = math.floor(low)  # whole units: the difference is taken first, so that nothing rounds
     after_ns = _since(values, origin) * unit
     first_ns = origin * unit - (stamp_ns if unit == since_1970 else 0)
     offset_ns = -float(after_ns.min()) if abs(first_ns) > LONGEST_SWEEP_S * 1e9 else float(first_ns)
-    return ((after_ns + offset_ns) * 1e-9).astype(np.float32)
+    seconds: Floats = (after_ns + offset_ns) * 1e-9
+    return seconds.astype(np.float32)
 
 
 def _since(values: Column, origin: int) -> NDArray[np.float64]:

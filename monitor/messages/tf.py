@@ -55,7 +55,7 @@ def motion(translation: tuple[float, float, float], quaternion: tuple[float, flo
     return T
 
 
-def encode(transforms: Sequence[Transform], stamp_ns: int) -> bytes:
+def encode_tf(transforms: Sequence[Transform], stamp_ns: int) -> bytes:
     """A TFMessage in CDR; the topic, not the message, tells static transforms apart.
 
     Args:

@@ -28,28 +28,36 @@ NORMALISATION = "rgb 0..255, centred and scaled in the graph"
 
 
 class Probabilities(torch.nn.Module):
-    """The network with the softmax over its head, as the run time wants it."""
+    """The network with the softmax over its head, the weights of the loss taken out again.
 
-    def __init__(self, network: BiSeNetV2) -> None:
+    A loss that weighs class c by w_c is least where the network says p_c ~ w_c q_c, q being the true share:
+    paint of weight 3 is then said with 0.75 where it is as likely as not. Subtracting log w_c gives q back.
+    """
+
+    def __init__(self, network: BiSeNetV2, class_weights: list[float]) -> None:
         super().__init__()
         self.network = network
+        self.register_buffer("overstated", torch.tensor(class_weights).log().view(1, -1, 1, 1))
 
     def forward(self, rgb: torch.Tensor) -> torch.Tensor:
         """Map (1, 3, H, W) to probabilities (1, classes, H/2, W/2)."""
         logits, _ = self.network(rgb)
-        return torch.softmax(logits, dim=1)
+        return torch.softmax(logits - self.overstated, dim=1)
 
 
-def to_onnx(network: BiSeNetV2, out: Path, *, version: str, data_sha256: str) -> None:
+def to_onnx(
+    network: BiSeNetV2, out: Path, *, class_weights: list[float], version: str, data_sha256: str
+) -> None:
     """Export the network in evaluation mode as a single file, written beside its name and renamed when whole.
 
     Args:
         network: With the weights to ship.
         out: The ``.onnx`` file.
+        class_weights: Weights of the loss that the network was trained with.
         version: Name of these weights.
         data_sha256: ``data.fingerprint`` of what they were trained on.
     """
-    model = Probabilities(network.to("cpu", memory_format=torch.contiguous_format)).eval()
+    model = Probabilities(network.to("cpu", memory_format=torch.contiguous_format), class_weights).eval()
     example = torch.zeros(1, 3, 2 * STRIDE, 4 * STRIDE)
     height, width = torch.export.Dim("rows", min=1, max=256), torch.export.Dim("columns", min=1, max=256)
     with tempfile.TemporaryDirectory(dir=out.parent) as folder:
@@ -88,7 +96,13 @@ def main() -> None:
     state = torch.load(options.checkpoint, map_location="cpu", weights_only=True)
     network = BiSeNetV2()
     network.load_state_dict(state["average"])
-    to_onnx(network, options.out, version=options.version, data_sha256=state["data_sha256"])
+    to_onnx(
+        network,
+        options.out,
+        class_weights=state["class_weights"],
+        version=options.version,
+        data_sha256=state["data_sha256"],
+    )
 
 
 if __name__ == "__main__":

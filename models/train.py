@@ -77,6 +77,7 @@ class Run:
             "step": self.step,
             "spent_s": self.spent_s,
             "data_sha256": data,
+            "class_weights": list(losses.CLASS_WEIGHTS),
         }
         torch.save(state, unfinished)
         unfinished.replace(path)

@@ -62,7 +62,8 @@ def test_a_change_anywhere_in_the_picture_reaches_a_cell(network):
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # of torch about itself
 def test_export_is_one_file_that_the_run_time_accepts_and_agrees_with(network, tmp_path):
     out = tmp_path / "net.onnx"
-    export.to_onnx(network, out, version="2.5", data_sha256="cd" * 32)
+    weights = [1.0 + 0.5 * c for c in range(CLASSES)]
+    export.to_onnx(network, out, class_weights=weights, version="2.5", data_sha256="cd" * 32)
     assert [path.name for path in tmp_path.iterdir()] == ["net.onnx"]
     segmenter = segmentation.Segmenter(out.read_bytes(), threads=1)
     assert (segmenter.info.version, segmenter.info.training_data) == ("2.5", "cd" * 32)
@@ -71,7 +72,8 @@ def test_export_is_one_file_that_the_run_time_accepts_and_agrees_with(network, t
         image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
         with torch.no_grad():
             logits, _ = network(torch.from_numpy(segmentation.network_input(image)))
-        expected = torch.softmax(logits, dim=1)[0].numpy()
+        weighted = torch.softmax(logits, dim=1)[0].numpy() / np.array(weights)[:, None, None]
+        expected = weighted / weighted.sum(axis=0)
         got = segmenter.probabilities(image)
         assert np.abs(got - expected[:, : got.shape[1], : got.shape[2]]).max() < 1e-4
 

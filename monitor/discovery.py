@@ -100,6 +100,10 @@ class Survey:
             news = True
         return news
 
+    def info_of(self, image: str) -> str | None:
+        """The CameraInfo topic that goes with an image topic, or None."""
+        return _info_of(self, image) if image in self.images else None
+
     def _see_transform(self, transform: Transform) -> bool:
         link = (transform.parent, transform.child)
         before = self.transforms.get(link)
@@ -124,7 +128,7 @@ class Discovery:
     notes: tuple[str, ...]
 
 
-def discover_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo]) -> Discovery:
+def survey_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo]) -> Survey:
     """Reads the beginning of a recording until every cloud and image topic is part of a pair.
 
     Args:
@@ -146,7 +150,12 @@ def discover_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo])
         all_seen = clouds | images <= survey.clouds.keys() | survey.images.keys() | survey.undecodable.keys()
         if news and all_seen and not discover(survey).missing:
             break
-    return discover(survey)
+    return survey
+
+
+def discover_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo]) -> Discovery:
+    """What the beginning of a recording allows to be watched; see :func:`survey_in`."""
+    return discover(survey_in(messages, topics))
 
 
 def discover(survey: Survey) -> Discovery:

@@ -133,6 +133,7 @@ class FramePair:
         image: The image.
         cloud_stamp_ns: Stamp of the sweep, ns.
         image_stamp_ns: Stamp of the image, ns.
+        sweep_s: Duration of the sweep in s where the source knows it, or None.
     """
 
     pair: str
@@ -140,6 +141,7 @@ class FramePair:
     image: CameraImage
     cloud_stamp_ns: int
     image_stamp_ns: int
+    sweep_s: float | None = None
 
     @property
     def gap_ns(self) -> int:

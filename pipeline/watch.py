@@ -34,6 +34,13 @@ no_scan_pattern: the cloud shows no rings, and the frame had no lines either.
 no_edges: no edge of the cloud falls into the image.
 """
 
+
+def _unmeasured(name: str) -> AbstractContextManager[None]:
+    """A stage whose cost nobody asked for."""
+    del name
+    return nullcontext()
+
+
 _LEAST_EDGES = 20
 """Edges below which a frame says nothing: three per axis."""
 
@@ -156,7 +163,7 @@ class Watch:
         """Stamps of the frames with lines in the window, ns."""
         return tuple(stamp for stamp, _ in self._line_frames)
 
-    def step(self, pair: FramePair, stage: Stage = nullcontext) -> Findings:
+    def step(self, pair: FramePair, stage: Stage = _unmeasured) -> Findings:
         """Takes one pair in; judges the window when that is due."""
         now_ns = pair.image_stamp_ns
         self._enter(now_ns)
@@ -357,7 +364,7 @@ class Watch:
         return solution if solution.estimate.features > 0 else None
 
 
-def _testimony(xi: Floats, information: Floats, B: Floats) -> Testimony:
+def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:
     """xi and its information in camera axes -> drift in vehicle axes (FORMULAS A4; B is orthogonal)."""
     return Testimony(B @ xi, B @ information @ B.T)
 

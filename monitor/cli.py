@@ -1,0 +1,113 @@
+"""The command line: parser, dispatch, and the one place that maps errors to exit codes (DESIGN 7).
+
+Commands are loaded when they are called, so that ``--help`` costs nothing.
+"""
+
+import importlib
+import logging
+import os
+import sys
+import traceback
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
+import click
+
+from pipeline.errors import CalibwatchError
+
+COMMANDS = {
+    "calibrate": "The extrinsic of a recording or a single frame, and how good it is.",
+    "demo": "Simulate a drive in which the camera mount slips, and watch it being told.",
+    "extrinsic": "Read extrinsics of other formats into a rig file.",
+    "inspect": "What a recording holds, which pairs could be watched, and what is missing.",
+    "replay": "Judge a recording: verdict, report, rerun recording.",
+    "run": "Watch live sensors on a zenoh bus.",
+}
+"""Name -> what ``--help`` says; the module of a command is ``monitor.commands.<name>``."""
+
+BAD_INPUT, INTERRUPTED = 1, 130
+"""Exit codes; wrong usage is click's 2, those of verdicts stand in monitor.status."""
+
+
+class _Commands(click.Group):
+    """Commands by name, imported when called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """All names, sorted."""
+        del ctx
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command, imported now."""
+        del ctx
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(f"monitor.commands.{cmd_name}").command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Lists the commands without importing them."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(COMMANDS.items()))
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """A misspelt command names the nearest one."""
+        if args and not args[0].startswith("-") and args[0] not in COMMANDS:
+            from monitor.rig_document import nearest  # noqa: PLC0415 - pydantic is not needed for --help
+
+            ctx.fail(f"no command '{args[0]}' ({nearest(args[0], sorted(COMMANDS))})")
+        return super().resolve_command(ctx, args)
+
+
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Examples: calibwatch demo --out out/demo; calibwatch replay drive.mcap --out out/drive",
+)
+@click.version_option(package_name="calibwatch")
+@click.option("-v", "--verbose", is_flag=True, help="Tell more on stderr.")
+def calibwatch(*, verbose: bool) -> None:
+    """Watches whether the extrinsic between LiDAR and camera still holds, while vehicles drive.
+
+    Exit codes: 0 healthy or done, 1 bad input or failure, 2 wrong usage, 3 drifted, 4 no statement.
+    """
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command line and exits with its code."""
+    try:
+        code = calibwatch.main(args=arguments, prog_name="calibwatch", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        sys.exit(INTERRUPTED)
+    except CalibwatchError as error:
+        click.echo(f"calibwatch: {_one_line(str(error))}", err=True)
+        sys.exit(BAD_INPUT)
+    except BrokenPipeError:
+        # The reader of our output went away; nothing can be told to it any more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(BAD_INPUT)
+    except Exception as error:  # noqa: BLE001 - the top of the program: reports and ends
+        click.echo(f"calibwatch: internal error: {_one_line(repr(error))} (trace in {_trace_file()})", err=True)
+        sys.exit(BAD_INPUT)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _trace_file() -> Path:
+    """Writes the trace of the present error where it can be sent in."""
+    with NamedTemporaryFile("w", prefix="calibwatch-", suffix=".trace", delete=False) as file:
+        traceback.print_exc(file=file)
+        return Path(file.name)

@@ -1,0 +1,93 @@
+"""One file per command: options -> call -> print. Every module offers ``command``."""
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from monitor.rig import parse_inject
+from pipeline.errors import CalibwatchError
+from pipeline.records import Floats
+
+
+class DriftParameter(click.ParamType[Floats]):
+    """``yaw=0.5,up=0.05``: degrees and metres by the six names."""
+
+    name = "AXIS=VALUE,..."
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Floats:
+        """Drift (6,), rad and m; a misspelt axis is wrong usage."""
+        try:
+            return parse_inject(str(value))
+        except CalibwatchError as error:
+            self.fail(str(error), param, ctx)
+
+
+def rig_option(function: Callable[..., object]) -> Callable[..., object]:
+    """``--rig FILE``."""
+    return click.option(
+        "--rig",
+        "rig_file",
+        type=click.Path(path_type=Path),
+        help="Rig file (TOML or JSON) or calib.json; default: what the recording says itself.",
+    )(function)
+
+
+def inject_option(function: Callable[..., object]) -> Callable[..., object]:
+    """``--inject AXIS=VALUE,...``."""
+    return click.option(
+        "--inject",
+        "drift",
+        type=DriftParameter(),
+        help="Alter the stored extrinsic so that this drift is true: yaw=0.5,up=0.05 (degrees, metres; "
+        "roll pitch yaw forward left up).",
+    )(function)
+
+
+def model_option(function: Callable[..., object]) -> Callable[..., object]:
+    """``--model FILE``."""
+    return click.option(
+        "--model", type=click.Path(path_type=Path), help="Segmentation network (.onnx); default: the one that ships."
+    )(function)
+
+
+def verdict_options(function: Callable[..., object]) -> Callable[..., object]:
+    """``--json`` and ``--exit-zero``."""
+    function = click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")(function)
+    return click.option(
+        "--exit-zero", is_flag=True, help="Exit with 0 for 'drifted' and 'no statement' too (else 3 and 4)."
+    )(function)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set; the second signal interrupts at once."""
+    stop = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        del number, frame
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def progress_line(what: str) -> Callable[[int], None] | None:
+    """Rewrites one line on stderr with a count; None where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(count: int) -> None:
+        click.echo(f"\r{what} {count}", nl=False, err=True)
+
+    return show

@@ -1,0 +1,170 @@
+"""FramePair or Tick in, events out: the only place where a frame becomes a verdict."""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from monitor.clock import Clock
+from monitor.events import Event, FrameEvent, StatusEvent
+from monitor.intake import Intake
+from monitor.statements import Identity, Measured, status_of
+from monitor.status import Rates, Timing
+from pipeline.records import FramePair
+from pipeline.watch import Findings, Watch
+
+_STATUS_EVERY_NS = 1_000_000_000
+"""ns of data between statuses while nothing changes (DESIGN 5)."""
+
+_TIMINGS = 200
+"""Measurements of a stage over which quantiles are told: 20 s at 10 Hz."""
+
+_STAMPS = 21
+"""Stamps over which rates are told: two seconds at 10 Hz."""
+
+
+class Engine:
+    """One pair: feeds its watch, accounts for its frames, tells its status.
+
+    Args:
+        identity: What every status repeats.
+        watch: The pair's window and verdict.
+        intake: Where frames are counted before they are pairs.
+        clock: Measures what stages cost.
+    """
+
+    def __init__(self, identity: Identity, watch: Watch, intake: Intake, clock: Clock) -> None:
+        self.identity = identity
+        self.watch = watch
+        self._intake = intake
+        self._clock = clock
+        self._seq = 0
+        self._told: tuple[str, str] | None = None
+        self._told_ns: int | None = None
+        self._now_ns = 0
+        self._used = 0
+        self._dropped: Counter[str] = Counter()
+        self._timing: dict[str, deque[float]] = {}
+        self._cloud_ns: deque[int] = deque(maxlen=_STAMPS)
+        self._image_ns: deque[int] = deque(maxlen=_STAMPS)
+        self.wrong_size: tuple[int, int] | None = None
+
+    @property
+    def used(self) -> int:
+        """Sweeps and images that took part so far."""
+        return self._used
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Sweeps and images of pairs that gave no evidence, by reason."""
+        return self._dropped
+
+    def step(self, pair: FramePair) -> list[Event]:
+        """Takes a pair in: what was seen in it, and the status where one is due."""
+        self._now_ns = pair.image_stamp_ns
+        self._cloud_ns.append(pair.cloud_stamp_ns)
+        self._image_ns.append(pair.image_stamp_ns)
+        with self._stage("frame"):
+            findings = self.watch.step(pair, self._stage)
+        if findings.dropped == "image_size":
+            self.wrong_size = pair.image.size
+        if findings.dropped is not None:
+            self._dropped[findings.dropped] += 2
+            return self._due()
+        self._used += 2
+        return [self._frame_event(pair, findings), *self._due()]
+
+    def tick(self, now_ns: int) -> list[Event]:
+        """Nothing came until ``now_ns``."""
+        self._now_ns = max(self._now_ns, now_ns)
+        self.watch.silent(self._now_ns)
+        return self._due()
+
+    def finish(self) -> list[Event]:
+        """The input has ended: the last status."""
+        self.watch.finish(self._now_ns)
+        return [self._status()]
+
+    def _due(self) -> list[Event]:
+        memory = self.watch.memory
+        if memory is None:
+            return []
+        changed = self._told != (memory.state, memory.code)
+        # Data time decides: a clock that ran back is a change of its own.
+        waited = self._told_ns is None or abs(self._now_ns - self._told_ns) >= _STATUS_EVERY_NS
+        return [self._status()] if changed or waited else []
+
+    def _status(self) -> StatusEvent:
+        memory = self.watch.memory
+        assert memory is not None  # noqa: S101 - set by the first step, tick or finish
+        self._told, self._told_ns = (memory.state, memory.code), self._now_ns
+        received, dropped = self._intake.account(self.identity.pair)
+        status = status_of(
+            self.identity,
+            self.watch.mount,
+            memory,
+            self.watch.belief,
+            Measured(
+                received=received,
+                used=self._used,
+                dropped=dropped + self._dropped,
+                window_ns=self.watch.window_stamps,
+                lines_ns=self.watch.line_stamps,
+                rates=self._rates(),
+                timing={name: _quantiles(values) for name, values in self._timing.items()},
+            ),
+            self._seq,
+            self._now_ns,
+        )
+        self._seq += 1
+        return StatusEvent(status)
+
+    def _rates(self) -> Rates:
+        gaps = [image - cloud for image, cloud in zip(self._image_ns, self._cloud_ns, strict=True)]
+        return Rates(
+            lidar_hz=_rate(self._cloud_ns),
+            camera_hz=_rate(self._image_ns),
+            gap_ms=float(np.median(gaps)) / 1e6 if gaps else None,
+            lines_hz=_rate(self.watch.line_stamps),
+            edges_hz=_rate(self._image_ns),
+        )
+
+    def _frame_event(self, pair: FramePair, findings: Findings) -> FrameEvent:
+        belief, lines = self.watch.belief, findings.lines
+        return FrameEvent(
+            pair=pair.pair,
+            stamp_ns=pair.image_stamp_ns,
+            image=pair.image,
+            camera=self.watch.mount.camera,
+            masks=findings.masks,
+            points=findings.cloud.xyz,
+            intensity=findings.cloud.intensity,
+            edge_points=findings.edge_points,
+            T_stored=self.watch.mount.T_cam_lidar,
+            T_estimated=None if belief is None else belief.T_estimated,
+            matches=() if belief is None or lines is None else belief.matches,
+            cloud_lines=() if lines is None else lines.cloud_lines,
+            image_lines=() if lines is None else lines.image_lines,
+        )
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        begun = self._clock.monotonic_ns()
+        try:
+            yield
+        finally:
+            spent = (self._clock.monotonic_ns() - begun) / 1e6
+            self._timing.setdefault(name, deque(maxlen=_TIMINGS)).append(spent)
+
+
+def _rate(stamps: deque[int] | tuple[int, ...]) -> float | None:
+    """Mean rate of ascending stamps, Hz; None for fewer than two."""
+    if len(stamps) < 2 or stamps[-1] <= stamps[0]:
+        return None
+    return (len(stamps) - 1) * 1e9 / (stamps[-1] - stamps[0])
+
+
+def _quantiles(values: deque[float]) -> Timing:
+    p50, p95 = np.quantile(np.array(values), [0.5, 0.95])
+    return Timing(p50=float(p50), p95=float(p95))

@@ -1,0 +1,165 @@
+"""Messages in, pairs of sweep and image out, with an account of every frame: decoding and pairing for a whole rig."""
+
+import logging
+from collections import Counter
+from dataclasses import dataclass
+
+from monitor.messages import CameraInfo, Decoded, Message, decode
+from monitor.rig import Rig, RigPair, camera_from_info
+from monitor.sync import Paired, Pairer, Side, middle_ns, pairer_for
+from pipeline.errors import CalibwatchError, InputError
+from pipeline.records import CameraImage, CameraModel, FramePair, PointCloud
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """A decoded frame that waits for its partner."""
+
+    stamp_ns: int
+    value: PointCloud | CameraImage
+    sweep_s: float | None
+
+
+@dataclass(slots=True)
+class _Lane:
+    """One pair of the rig on its way through the intake."""
+
+    pair: RigPair
+    pairer: Pairer[object, object]
+    camera: CameraModel | None
+    dropped: Counter[str]
+    received: int = 0
+
+
+class Intake:
+    """Decodes the topics of a rig and pairs their frames.
+
+    Args:
+        rig: Every topic is named.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._lanes = [_Lane(pair, pairer_for(pair), pair.camera.model, Counter()) for pair in rig.pairs]
+        self._told: set[tuple[str, str]] = set()
+        self.notes: list[str] = []
+
+    def camera(self, pair: str) -> CameraModel | None:
+        """Intrinsics of a pair, once they are known."""
+        return self._lane(pair).camera
+
+    def account(self, pair: str) -> tuple[int, Counter[str]]:
+        """Frames (sweeps and images) that came for a pair, and what was dropped before it became a pair."""
+        lane = self._lane(pair)
+        dropped = Counter(lane.dropped)
+        for (_, reason), number in lane.pairer.dropped.items():
+            dropped[reason] += number
+        return lane.received, +dropped
+
+    def offset_ns(self, pair: str) -> int | None:
+        """Median of camera stamp minus LiDAR stamp, ns."""
+        return self._lane(pair).pairer.offset_ns
+
+    def take(self, message: Message) -> list[FramePair]:
+        """The pairs that a message completes. What can not be decoded is counted and told once per topic."""
+        lanes = [
+            (lane, side) for lane in self._lanes if (side := _side_of(lane.pair, message.topic)) is not None
+        ]
+        infos = [lane for lane in self._lanes if lane.pair.camera.info == message.topic]
+        if not lanes and not any(lane.camera is None for lane in infos):
+            return []
+        for lane, _ in lanes:
+            lane.received += 1
+        try:
+            decoded = decode(message)
+        except InputError as error:
+            self._tell(message.topic, str(error))
+            for lane, _ in lanes:
+                lane.dropped["undecodable"] += 1
+            return []
+        for lane in infos:
+            self._inform(lane, decoded)
+        pairs: list[FramePair] = []
+        for lane, side in lanes:
+            pairs += self._push(lane, side, message, decoded)
+        return pairs
+
+    def flush(self) -> list[FramePair]:
+        """Nothing more comes: the pairs that were still waiting."""
+        return [_frame_pair(lane.pair, paired) for lane in self._lanes for paired in lane.pairer.flush()]
+
+    def _push(
+        self, lane: _Lane, side: Side, message: Message, decoded: tuple[Decoded, ...]
+    ) -> list[FramePair]:
+        """Hands a frame to the pairing of its lane."""
+        pairs: list[FramePair] = []
+        for one in decoded:
+            stamp_ns = one.stamp_ns or message.log_ns
+            match one.value, side:
+                case PointCloud() as cloud, "lidar":
+                    frame = _Frame(stamp_ns, cloud, message.sweep_s)
+                    compared = middle_ns(stamp_ns, cloud, message.sweep_s, lane.pair.lidar.stamp)
+                    found = lane.pairer.push_lidar(compared, frame, message.sequence)
+                case CameraImage() as image, "camera":
+                    frame = _Frame(stamp_ns, image, None)
+                    found = lane.pairer.push_camera(stamp_ns, frame, message.sequence)
+                case _:
+                    lane.dropped["wrong_type"] += 1
+                    self._tell(
+                        message.topic, f"topic {message.topic} carries {message.type}, not {_wanted(side)}"
+                    )
+                    continue
+            pairs += [_frame_pair(lane.pair, paired) for paired in found]
+        return pairs
+
+    def _inform(self, lane: _Lane, decoded: tuple[Decoded, ...]) -> None:
+        """Takes intrinsics from the first CameraInfo of a lane that has none."""
+        if lane.camera is not None:
+            return
+        for one in decoded:
+            if isinstance(one.value, CameraInfo):
+                topic = lane.pair.camera.topic or ""
+                try:
+                    lane.camera, _ = camera_from_info(
+                        one.value, rectified=lane.pair.camera.rectified, topic=topic
+                    )
+                except CalibwatchError as error:
+                    self._tell(topic, str(error))
+
+    def _lane(self, pair: str) -> _Lane:
+        return next(lane for lane in self._lanes if lane.pair.name == pair)
+
+    def _tell(self, topic: str, what: str) -> None:
+        """One line for people the first time a topic gives trouble; counts tell the rest."""
+        key = (topic, what.partition(":")[0])
+        if key not in self._told:
+            self._told.add(key)
+            self.notes.append(what)
+            _log.warning("%s", what)
+
+
+def _side_of(pair: RigPair, topic: str) -> Side | None:
+    if pair.lidar.topic == topic:
+        return "lidar"
+    return "camera" if pair.camera.topic == topic else None
+
+
+def _wanted(side: Side) -> str:
+    return "a point cloud" if side == "lidar" else "an image"
+
+
+def _frame_pair(pair: RigPair, paired: Paired[object, object]) -> FramePair:
+    lidar, camera = paired.lidar, paired.camera
+    assert isinstance(lidar, _Frame)  # noqa: S101 - only frames are pushed
+    assert isinstance(camera, _Frame)  # noqa: S101 - likewise
+    assert isinstance(lidar.value, PointCloud)  # noqa: S101 - by its side
+    assert isinstance(camera.value, CameraImage)  # noqa: S101 - likewise
+    return FramePair(
+        pair=pair.name,
+        cloud=lidar.value,
+        image=camera.value,
+        cloud_stamp_ns=lidar.stamp_ns,
+        image_stamp_ns=camera.stamp_ns,
+        sweep_s=lidar.sweep_s,
+    )

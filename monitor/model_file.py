@@ -1,0 +1,35 @@
+"""Where the segmentation network comes from: the file that ships with the package, or one that is named."""
+
+from importlib import resources
+from pathlib import Path
+
+from pipeline.errors import ModelError
+
+DEFAULT_NAME = "bisenetv2.onnx"
+"""Package data of ``models``; nothing is imported from there."""
+
+_LARGEST_BYTES = 256 << 20
+"""A network for two cores has megabytes; more is another kind of file."""
+
+
+def model_bytes(path: Path | None) -> bytes:
+    """The bytes of the network at ``path``, or of the one that ships; ModelError says what is missing."""
+    if path is None:
+        packaged = resources.files("models").joinpath(DEFAULT_NAME)
+        if not packaged.is_file():
+            raise ModelError(
+                f"the network {DEFAULT_NAME} is missing from this installation",
+                hint="install calibwatch anew, or name a model with --model FILE",
+            )
+        return packaged.read_bytes()
+    try:
+        size = path.stat().st_size
+        if size > _LARGEST_BYTES:
+            raise ModelError(
+                f"{path} has {size} bytes, too many for a network", hint="--model wants a .onnx file"
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(
+            f"model {path} can not be read: {error.strerror}", hint="--model wants a .onnx file"
+        ) from error

@@ -1,0 +1,145 @@
+"""From a recording and, perhaps, a rig file to a rig in which nothing is missing (DESIGN 3)."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from monitor.discovery import Survey, compose, discover, path, survey_in
+from monitor.rig import Rig, RigPair, bind, camera_from_info, inject, load_rig, parse_rig
+from monitor.sources import Source, TopicInfo, open_source
+from pipeline.errors import InputError, RigError
+from pipeline.records import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """A rig whose every pair has topics, intrinsics and an extrinsic.
+
+    Attributes:
+        rig: The rig.
+        notes: How it came about, one sentence each.
+    """
+
+    rig: Rig
+    notes: tuple[str, ...]
+
+
+def prepare(location: str, rig_file: Path | None, drift: Floats | None) -> Prepared:
+    """The rig for a recording: from ``rig_file``, else from the recording itself.
+
+    Args:
+        location: The recording.
+        rig_file: A rig file or ``calib.json``, or None.
+        drift: float64 (6,), altered into every stored extrinsic (``--inject``), or None.
+
+    Raises:
+        InputError: The recording can not be read or does not hold what the rig names.
+        RigError: The rig file is wrong, or something it leaves open is not in the recording.
+    """
+    with open_source(location) as source:
+        own = source.rig_document()
+        topics = source.describe()
+        if rig_file is not None:
+            rig, notes = _from_file(rig_file, own, topics, location), (f"rig from {rig_file}",)
+        elif own is not None:
+            rig, notes = (
+                bind(parse_rig(own, where=location), topics, where=location),
+                ("rig from the folder",),
+            )
+        else:
+            return Prepared(*_with_drift(*_discovered(source, topics, location), drift))
+    rig = completed(rig, lambda: _survey(location, topics))
+    return Prepared(*_with_drift(rig, notes, drift))
+
+
+def _with_drift(rig: Rig, notes: tuple[str, ...], drift: Floats | None) -> tuple[Rig, tuple[str, ...]]:
+    if drift is None:
+        return rig, notes
+    return dataclasses.replace(rig, pairs=tuple(inject(pair, drift) for pair in rig.pairs)), notes
+
+
+def _from_file(rig_file: Path, own: dict[str, object] | None, topics: Sequence[TopicInfo], where: str) -> Rig:
+    """The rig of a file; what it leaves open of topics and pairing is taken from the folder's own rig."""
+    rig = load_rig(rig_file)
+    if own is None:
+        return bind(rig, topics, where=where)
+    folder = parse_rig(own, where=where)
+    return bind(
+        dataclasses.replace(rig, pairs=tuple(_placed(pair, folder) for pair in rig.pairs)),
+        topics,
+        where=where,
+    )
+
+
+def _placed(pair: RigPair, folder: Rig) -> RigPair:
+    """A pair without topics gets those of the folder's pair of that name, else of the first."""
+    if pair.lidar.topic is not None or pair.camera.topic is not None:
+        return pair
+    own = next((other for other in folder.pairs if other.name == pair.name), folder.pairs[0])
+    return dataclasses.replace(
+        pair,
+        lidar=dataclasses.replace(pair.lidar, topic=own.lidar.topic),
+        camera=dataclasses.replace(pair.camera, topic=own.camera.topic),
+        pairing=own.pairing,
+    )
+
+
+def _discovered(source: Source, topics: Sequence[TopicInfo], location: str) -> tuple[Rig, tuple[str, ...]]:
+    found = discover(survey_in(source, topics))
+    if found.rig is None:
+        raise InputError(
+            f"{location} does not say how its sensors are mounted: {'; '.join(found.missing)}",
+            hint="give a rig file with --rig",
+        )
+    return found.rig, found.notes
+
+
+def _survey(location: str, topics: Sequence[TopicInfo]) -> Survey:
+    with open_source(location) as source:
+        return survey_in(source, topics)
+
+
+def completed(rig: Rig, survey: Callable[[], Survey]) -> Rig:
+    """The rig with intrinsics and extrinsics that its file leaves open, taken from the messages.
+
+    Args:
+        rig: Topics are named.
+        survey: Reads the beginning of the messages; called only if something is open.
+    """
+    if all(pair.camera.model is not None and pair.T_cam_lidar is not None for pair in rig.pairs):
+        return rig
+    seen = survey()
+    return dataclasses.replace(rig, pairs=tuple(_completed(pair, seen) for pair in rig.pairs))
+
+
+def _completed(pair: RigPair, survey: Survey) -> RigPair:
+    if pair.store is not None:
+        raise RigError(
+            f"pair {pair.name} wants extrinsic 'store:{pair.store}', but there is no extrinsic store here",
+            hint="give T_cam_lidar in the rig file, or import one with calibwatch extrinsic import",
+        )
+    image, cloud = pair.camera.topic or "", pair.lidar.topic or ""
+    camera = pair.camera
+    if camera.model is None:
+        info_topic = camera.info or survey.info_of(image)
+        if info_topic is None or info_topic not in survey.infos:
+            raise RigError(
+                f"pair {pair.name}: no intrinsics for {image}",
+                hint="give K, D, width, height or info in the rig",
+            )
+        model, _ = camera_from_info(survey.infos[info_topic][1], rectified=camera.rectified, topic=image)
+        camera = dataclasses.replace(camera, model=model)
+    T = pair.T_cam_lidar
+    if T is None:
+        source = pair.lidar.frame or survey.clouds.get(cloud, "")
+        target = camera.frame or (survey.images[image][0] if image in survey.images else "")
+        chain = path(survey.transforms.values(), target, source)
+        if chain is None:
+            raise RigError(
+                f"pair {pair.name}: no extrinsic, and no chain of transforms from {source or '(no frame)'} "
+                f"to {target or '(no frame)'}",
+                hint="give T_cam_lidar in the rig file, or record tf_static",
+            )
+        T = compose(chain)
+    return dataclasses.replace(pair, camera=camera, T_cam_lidar=T)

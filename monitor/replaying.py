@@ -1,0 +1,66 @@
+"""A recording from its file to the files that judge it."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from monitor.clock import SystemClock
+from monitor.daemon import watch, watching
+from monitor.model_file import model_bytes
+from monitor.outputs import Surroundings, open_outputs
+from monitor.outputs.summary import FILE_NAME, Summary
+from monitor.preparation import prepare
+from monitor.sources import open_source
+from pipeline.errors import InputError
+from pipeline.parameters import Parameters
+from pipeline.records import Floats
+from pipeline.segmentation import Segmenter
+
+OUTPUTS = ("status_log", "summary", "recording", "report")
+"""What a replay writes (DESIGN 7)."""
+
+
+def replay(
+    location: str,
+    rig_file: Path | None,
+    drift: Floats | None,
+    out: Path,
+    *,
+    model: Path | None,
+    images_hz: float,
+    over_zenoh: bool,
+    stop: threading.Event,
+    progress: Callable[[int], None] | None,
+) -> Summary:
+    """Judges a recording and writes its files into ``out``.
+
+    Args:
+        location: The recording.
+        rig_file: Rig file or calib.json, or None: the recording speaks for itself.
+        drift: float64 (6,), altered into the stored extrinsics, or None.
+        out: Folder, made where it is absent.
+        model: The network's file, or None: the one that ships.
+        images_hz: Images kept in the recording.
+        over_zenoh: Whether messages go through a zenoh session.
+        stop: Ends the run early.
+        progress: Told the number of pairs.
+
+    Raises:
+        CalibwatchError: The recording, rig or model can not be used; no file then looks whole.
+    """
+    prepared = prepare(location, rig_file, drift)
+    segmenter = Segmenter(model_bytes(model))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"folder {out} can not be made: {error.strerror}", hint="--out wants a folder") from error
+    # What an earlier run left there must not pass for this one's.
+    (out / FILE_NAME).unlink(missing_ok=True)
+    outputs = open_outputs(OUTPUTS, Surroundings(prepared.rig.vehicle, folder=out, images_hz=images_hz))
+    try:
+        under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
+        with open_source(location) as source:
+            watch(under_watch, source, source.losses, stop, progress)
+    finally:
+        outputs.close()
+    return Summary.model_validate_json((out / FILE_NAME).read_bytes())

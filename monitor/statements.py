@@ -1,0 +1,183 @@
+"""Belief and memory of a watch -> the status that is told (DESIGN 5). Radians become degrees here and only here."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from monitor.status import (
+    AXIS_NAMES,
+    AxisDrift,
+    AxisValues,
+    Drift,
+    Frames,
+    Onset,
+    Provenance,
+    Rates,
+    Status,
+    TimeOffset,
+    Timing,
+    Window,
+    Witness,
+    Witnesses,
+    finite,
+)
+from pipeline import verdict
+from pipeline.fusion import Testimony
+from pipeline.records import Floats
+from pipeline.watch import Belief, Mount
+
+TO_PEOPLE = np.array([180.0 / math.pi] * 3 + [1.0] * 3)
+"""rad, m -> deg, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What every status of a pair repeats.
+
+    Attributes:
+        vehicle: Name.
+        pair: Name.
+        extrinsic: Of the stored extrinsic.
+        model: Of the network.
+        software: Name and version.
+    """
+
+    vehicle: str
+    pair: str
+    extrinsic: Provenance
+    model: Provenance
+    software: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What the engine counted and timed.
+
+    Attributes:
+        received: Sweeps and images that came.
+        used: Sweeps and images that took part.
+        dropped: Reason -> number.
+        window_ns: Stamps of the window's frames with edges.
+        lines_ns: Stamps of the window's frames with lines.
+        rates: Of the inputs.
+        timing: Stage -> quantiles.
+    """
+
+    received: int
+    used: int
+    dropped: Counter[str]
+    window_ns: tuple[int, ...]
+    lines_ns: tuple[int, ...]
+    rates: Rates
+    timing: Mapping[str, Timing]
+
+
+def status_of(
+    identity: Identity,
+    mount: Mount,
+    memory: verdict.Memory,
+    belief: Belief | None,
+    measured: Measured,
+    seq: int,
+    stamp_ns: int,
+) -> Status:
+    """The status of a pair at ``stamp_ns``."""
+    onset = memory.onset
+    stamps = measured.window_ns or measured.lines_ns
+    return Status(
+        vehicle=identity.vehicle,
+        pair=identity.pair,
+        seq=seq,
+        stamp_ns=stamp_ns,
+        state=memory.state,
+        code=memory.code,
+        reason=memory.reason,
+        since_ns=memory.since_ns,
+        onset=None
+        if onset is None
+        else Onset(stamp_ns=onset.stamp_ns, from_ns=onset.from_ns, to_ns=onset.to_ns),
+        severity=memory.severity,
+        drift=_drift(mount, memory, belief),
+        witnesses=_witnesses(belief),
+        window=Window(
+            frames=len(stamps),
+            span_s=(stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0,
+            lines_lane=_matched(belief, "lane"),
+            lines_pole=_matched(belief, "pole"),
+            lines_structure=_matched(belief, "structure"),
+        ),
+        frames=Frames(received=measured.received, used=measured.used, dropped=dict(measured.dropped)),
+        rates=measured.rates,
+        time_offset=TimeOffset(ms=None, sigma_ms=None, separable=False),
+        timing_ms=dict(measured.timing),
+        extrinsic=identity.extrinsic,
+        model=identity.model,
+        software=identity.software,
+    )
+
+
+def _drift(mount: Mount, memory: verdict.Memory, belief: Belief | None) -> Drift:
+    axes: dict[str, AxisDrift] = {}
+    limits = mount.limits * TO_PEOPLE
+    for index, name in enumerate(AXIS_NAMES):
+        if belief is None:
+            axes[name] = AxisDrift(
+                value=None,
+                sigma=None,
+                protection_level=None,
+                alert_limit=float(limits[index]),
+                detectable=None,
+                observable=False,
+                monitored=False,
+                last_seen_ns=memory.last_seen_ns[index],
+            )
+            continue
+        j, scale = belief.judgement, float(TO_PEOPLE[index])
+        observable = bool(j.observable[index])
+        axes[name] = AxisDrift(
+            value=finite(j.drift[index] * scale),
+            sigma=finite(j.sigma[index] * scale) if observable else None,
+            protection_level=finite(j.protection_level[index] * scale) if observable else None,
+            alert_limit=float(limits[index]),
+            detectable=finite(j.detectable[index] * scale) if observable else None,
+            observable=observable,
+            monitored=bool(j.monitored[index]),
+            last_seen_ns=memory.last_seen_ns[index],
+        )
+    return Drift(axes="camera" if mount.T_vehicle_lidar is None else "vehicle", relative_to="stored", **axes)
+
+
+def _witnesses(belief: Belief | None) -> Witnesses:
+    if belief is None:
+        return Witnesses(lines=None, edges=None)
+    edges = lines = None
+    if belief.edges is not None and belief.edges_drift is not None:
+        edges = _witness(belief.edges_drift, belief.edges.frames, None)
+    if belief.lines is not None and belief.lines_drift is not None:
+        estimate = belief.lines.estimate
+        lines = _witness(belief.lines_drift, estimate.frames, estimate.chi2)
+    return Witnesses(lines=lines, edges=edges)
+
+
+def _witness(testimony: Testimony, frames: int, chi2: float | None) -> Witness:
+    sigma = np.sqrt(np.diag(testimony.covariance()))
+    return Witness(
+        drift=_values(testimony.drift),
+        sigma=_values(sigma),
+        chi2=None if chi2 is None else finite(chi2),
+        frames=frames,
+    )
+
+
+def _values(six: Floats) -> AxisValues:
+    people = six * TO_PEOPLE
+    return AxisValues(**{name: finite(people[index]) for index, name in enumerate(AXIS_NAMES)})
+
+
+def _matched(belief: Belief | None, label: str) -> int:
+    if belief is None or belief.lines is None:
+        return 0
+    return sum(1 for frame in belief.lines.matches for match in frame if match.cloud.label == label)

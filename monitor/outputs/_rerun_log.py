@@ -1,8 +1,8 @@
-"""What a recording holds, as entities of rerun: the only module that imports it, loaded when a recording opens.
+"""What a recording holds, as entities of rerun: the only module that imports it; loaded by an open recording.
 
 Entities per pair: ``image`` (the picture), ``image/masks``, ``image/lines``, ``image/stored`` and
-``image/estimated`` (the cloud, projected by our lens model, and matched lines); ``lidar/points``, ``lidar/lines``
-and the camera under both extrinsics; ``drift/<axis>``; ``state`` and ``log``.
+``image/estimated`` (the cloud, projected by our lens model, and matched lines); ``lidar/points``,
+``lidar/lines`` and the camera under both extrinsics; ``drift/<axis>``; ``state`` and ``log``.
 """
 
 from pathlib import Path
@@ -63,6 +63,7 @@ class RerunLog:
         self._rec.send_recording_name(vehicle)
         self._pairs: list[str] = []
         self._states: dict[str, str] = {}
+        self._latest_ns = 0
 
     def status(self, status: Status) -> None:
         """Drift of every axis with its limits; the state where it changed."""
@@ -107,6 +108,7 @@ class RerunLog:
 
     def note(self, level: str, text: str) -> None:
         """A line in the log of every pair, at the latest stamp."""
+        self._at(self._latest_ns)
         for pair in self._pairs or ["run"]:
             self._rec.log(_path(pair, "log"), rr.TextLog(text, level=level))
 
@@ -122,6 +124,8 @@ class RerunLog:
         self._rec.disconnect()
 
     def _at(self, stamp_ns: int) -> None:
+        """Everything that this thread logs from here on has this stamp."""
+        self._latest_ns = stamp_ns
         self._rec.set_time("stamp", timestamp=np.datetime64(stamp_ns, "ns"))
 
     def _projected(self, frame: FrameEvent, name: str, T: Floats, colour: tuple[int, int, int]) -> None:

@@ -1,10 +1,10 @@
 """``recording.rrd``: what was seen and said, for the viewer of rerun.
 
-Data go through a bounded queue to a thread of their own: the engine never waits for the disk. A full queue drops
-its oldest event of the kind that comes. A second thread flushes on a timer, for a file that fills up raises nothing
-until it is flushed; a failed flush means that the recording is lost, which :attr:`Recording.lost` says. Nothing
-listens on the network, and the part of rerun that writes files sends no analytics (its viewer does until
-``rerun analytics disable`` was run).
+Data go through a bounded queue to a thread of their own: the engine never waits for the disk. A full queue
+drops its oldest event of the kind that comes. A second thread flushes on a timer, for a file that fills up
+raises nothing until it is flushed; a failed flush means that the recording is lost, which
+:attr:`Recording.lost` says. Nothing listens on the network, and the part of rerun that writes files sends no
+analytics (its viewer does until ``rerun analytics disable`` was run).
 """
 
 import threading
@@ -157,8 +157,8 @@ class Recording:
                 continue  # what is left is let go
             try:
                 self._put(event)
-            except OSError as error:
-                self._lose(str(error))
+            except Exception as error:  # noqa: BLE001 # top of a thread: reports and lets the rest go
+                self._lose(f"{type(error).__name__}: {error}")
 
     def _put(self, event: Event) -> None:
         if isinstance(event, FrameEvent):

@@ -218,7 +218,7 @@ class Drive:
         yield end or EndEvent(complete=True)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def drive() -> Callable[..., Drive]:
     return Drive
 

@@ -1,0 +1,388 @@
+"""How the LiDAR moved between two sweeps, from the sweeps alone: registration of small planes (surfels).
+
+The surfels of the later sweep are moved onto those of the earlier one, point to plane, under a loss that
+moving vehicles can not pull. Nothing is set per sensor or frame: no axis, no rings, no ground. Where the
+scene leaves a direction free (a tunnel, an open field) no motion is claimed.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipeline.deskew import SpinSense, Twist, displaced
+from pipeline.ground import plane_basis
+from pipeline.records import Floats, PointCloud, read_only
+from pipeline.surfels import Surfels, surfels
+
+UnknownReason: TypeAlias = Literal[
+    "few planes", "free direction", "no agreement", "uncertain", "implausible speed"
+]
+"""Why no motion is claimed: too few surfels; the scene's planes leave a direction free; planes that would
+fix a direction do not fit the motion; the covariance is too large; faster than a vehicle."""
+
+MIN_SURFELS = 150
+"""Surfels below which nothing is registered: 25 for each of six unknowns."""
+
+SURFACE_SIGMA_M = 0.01
+"""m; what walls and roads are not flat within a cell, added to the measured thickness."""
+
+ALIKE_COSINE = 0.85
+"""Least cosine between the normals of a match: 32 deg, beyond it lies another side of a thing."""
+
+ITERATIONS = 12
+"""Gauss-Newton steps at most; a start from the last twist takes five."""
+
+SETTLED = 2e-3
+"""m/s and rad/s; a smaller step ends the iteration: it moves points by 0.2 mm in a sweep."""
+
+LOSS_SCALE = 3.0
+"""Robust (Geman-McClure) scale in standard deviations; at twice it a match counts 1/25; what lies within it
+fits."""
+
+FASTEST_M_S = 70.0
+"""m/s; 250 km/h. Faster is a wrong match, or no road vehicle."""
+
+SEARCHED_M_S = 40.0
+"""m/s; without a start, speeds up to 144 km/h are sought; a faster vehicle is found once it was slower."""
+
+SEARCH_STEP_M = 0.6
+"""m between tried displacements: half of it is within the gate of a surfel at 8 m and beyond."""
+
+SEARCH_SURFELS = 500
+"""Surfels that judge a displacement: those with the rarest normals, for the road fits anywhere."""
+
+MIN_SHARE = 0.02
+"""Least share of the surfels' normals along the weakest direction (1/3 if all were alike): noise of normals
+(3 deg) alone gives 0.003, and such noise draws the motion to zero."""
+
+MIN_AGREEMENT = 0.25
+"""Share of what the scene holds along each direction that must fit the motion: at a wrong optimum the road
+fits and what would fix the direction does not (below 0.1); the rest is new, hidden or itself in motion."""
+
+MAX_SIGMA_M_S = 0.5
+"""m/s; half a sweep of it displaces points by 2.5 cm."""
+
+MAX_SIGMA_RAD_S = math.radians(2.0)
+"""rad/s; half a sweep of it turns points by 0.1 deg."""
+
+_TURN = 2.0 * math.pi
+_HALF_WAY = 0.5
+"""Turns; the border between two of -1, 0 and +1."""
+_SURE = 3.0
+"""Standard deviations by which a spin sense must be told."""
+_LEAST_PAIRS = 3
+"""Pairs of sweeps behind a spin sense: fewer show no scatter, and one distorted sweep would decide."""
+
+VARIANCE_INFLATION = 4.0
+"""Neighbouring surfels err together (one wall, one bend of the road): seen as scatter of twice the plain
+sigma."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """A twist that can be trusted.
+
+    Attributes:
+        twist: Of the LiDAR in its own axes.
+        covariance: float64 (6,6) of ``twist.vector``, (rad/s, m/s).
+        overlap: Share of the later sweep's surfels that fit the earlier one.
+        residual_m: Robust standard deviation of the fitting surfels from their planes, m.
+        weakest: Share of the surfels' normals along the direction that they fix least, 0..1/3.
+    """
+
+    twist: Twist
+    covariance: Floats
+    overlap: float
+    residual_m: float
+    weakest: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", read_only(self.covariance))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionUnknown:
+    """Two sweeps that do not tell the motion.
+
+    Attributes:
+        reason: Why, from a closed list.
+        free: float64 (3,), unit, LiDAR frame: the direction in which the motion is not known, or None.
+    """
+
+    reason: UnknownReason
+    free: Floats | None = None
+
+
+_Pairs: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Indices (m,) into the later surfels and (m,) into the earlier."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matches:
+    """Surfels of the later sweep beside those of the earlier one, whitened.
+
+    Attributes:
+        tau: float64 (m,), s between the two measurements.
+        moved: float64 (m,3), later centres at the instant of the earlier ones.
+        normal: float64 (m,3), of the earlier surfels.
+        sigma: float64 (m,), m, of the distance across the plane.
+        error: float64 (m,), distance across the plane over ``sigma``.
+        scale: Robust standard deviation of ``error``.
+        weight: float64 (m,), 0..1, of the robust loss.
+    """
+
+    tau: Floats
+    moved: Floats
+    normal: Floats
+    sigma: Floats
+    error: Floats
+    scale: float
+    weight: Floats
+
+
+def estimate_twist(
+    previous: PointCloud | Surfels, current: PointCloud | Surfels, seconds: float, start: Twist | None
+) -> Motion | MotionUnknown:
+    """The constant twist between two sweeps of one LiDAR.
+
+    ``Exp((seconds + t_i - t_j) w)`` maps a point of the current sweep, measured t_i after its stamp, onto
+    the surface that the previous sweep saw t_j after its own (FORMULAS G3 between two sweeps); no sweep
+    needs to be straightened before. Without times a direction is taken to be measured at the same time of
+    each sweep, which errs by the little that it turned in between.
+
+    Args:
+        previous: The earlier sweep; its surfels where the caller kept them from the last call.
+        current: The later sweep, likewise.
+        seconds: Stamp of the later sweep minus that of the earlier, > 0.
+        start: The last twist, or None: all speeds up to 40 m/s are tried, which takes ten times as long.
+
+    Returns:
+        The motion, or why it is not known.
+    """
+    earlier = previous if isinstance(previous, Surfels) else surfels(previous)
+    later = current if isinstance(current, Surfels) else surfels(current)
+    if min(len(earlier), len(later)) < MIN_SURFELS:
+        return MotionUnknown("few planes")
+    tree = cKDTree(earlier.centre)
+    if start is None:
+        start = _searched(earlier, later, tree, seconds)
+    twist = start
+    for _ in range(ITERATIONS):
+        matches = _matched(earlier, later, tree, seconds, twist)
+        if len(matches.tau) < MIN_SURFELS:
+            return MotionUnknown("no agreement")
+        information, gradient = _normal_equations(matches)
+        # A billionth of the largest entry keeps a free direction where it is; it is told below.
+        ridge = 1e-9 * float(np.trace(information)) * np.eye(6)
+        step = -np.linalg.solve(information + ridge, gradient)
+        twist = Twist(twist.omega + step[:3], twist.velocity + step[3:])
+        if float(np.abs(step).max()) < SETTLED:
+            break
+        if float(np.linalg.norm(twist.velocity)) > FASTEST_M_S:
+            return MotionUnknown("implausible speed")
+    return _judged(matches, later, twist, seconds)
+
+
+def _paired(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float, twist: Twist) -> _Pairs:
+    """Nearest earlier surfel for each of the later, where it lies within a cell and faces alike."""
+    distance, found = tree.query(displaced(later.centre, np.full(len(later), seconds), twist))
+    nearest = np.asarray(found, dtype=np.int64)
+    turned = later.normal @ twist.pose(seconds)[:3, :3].T
+    alike = np.abs(np.einsum("ij,ij->i", turned, earlier.normal[nearest])) > ALIKE_COSINE
+    chosen = np.flatnonzero(alike & (distance < earlier.size[nearest]))
+    return chosen, nearest[chosen]
+
+
+def _compared(earlier: Surfels, later: Surfels, pairs: _Pairs, tau: Floats, twist: Twist) -> _Matches:
+    """The pairs under a twist that lasted ``tau`` (m,) between the two measurements."""
+    chosen, partner = pairs
+    moved = displaced(later.centre[chosen], tau, twist)
+    normal = earlier.normal[partner]
+    sigma = np.sqrt(earlier.thickness[partner] ** 2 + later.thickness[chosen] ** 2 + SURFACE_SIGMA_M**2)
+    error = np.einsum("ij,ij->i", moved - earlier.centre[partner], normal) / sigma
+    scale = max(1.4826 * float(np.median(np.abs(error))), 1e-3) if chosen.size else 1.0
+    weight = 1.0 / (1.0 + (error / (LOSS_SCALE * scale)) ** 2) ** 2
+    return _Matches(tau, moved, normal, sigma, error, scale, weight)
+
+
+def _matched(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float, twist: Twist) -> _Matches:
+    pairs = _paired(earlier, later, tree, seconds, twist)
+    tau = np.full(pairs[0].size, seconds)
+    if earlier.time is not None and later.time is not None:
+        tau = tau + later.time[pairs[0]] - earlier.time[pairs[1]]
+    return _compared(earlier, later, pairs, tau, twist)
+
+
+def _jacobian(matches: _Matches) -> Floats:
+    """Derivative (m,6) of ``error`` by the twist: the left one, ``tau [p x n, n] / sigma``."""
+    lever = np.concatenate([np.cross(matches.moved, matches.normal), matches.normal], axis=1)
+    return np.asarray(lever * (matches.tau / matches.sigma)[:, None])
+
+
+def _normal_equations(matches: _Matches) -> tuple[Floats, Floats]:
+    J = _jacobian(matches)
+    weighted = J * matches.weight[:, None]
+    return weighted.T @ J, weighted.T @ matches.error
+
+
+def _judged(matches: _Matches, later: Surfels, twist: Twist, seconds: float) -> Motion | MotionUnknown:
+    """The motion, or what speaks against it."""
+    R = twist.pose(seconds)[:3, :3]
+    every = later.normal @ R.T
+    held = every.T @ every / len(every)
+    shares, directions = np.linalg.eigh(held)
+    # Directions are told in the LiDAR frame of the earlier sweep: a sweep later it has turned by a degree
+    # or two.
+    if float(shares[0]) < MIN_SHARE:
+        return MotionUnknown("free direction", read_only(directions[:, 0]))
+    fitting = matches.normal[np.abs(matches.error) < LOSS_SCALE * matches.scale]
+    fit = fitting.T @ fitting / len(every)
+    whiten = directions / np.sqrt(shares)
+    agreement, axes = np.linalg.eigh(whiten.T @ fit @ whiten)
+    if float(agreement[0]) < MIN_AGREEMENT:
+        against = whiten @ axes[:, 0]
+        return MotionUnknown("no agreement", read_only(against / np.linalg.norm(against)))
+    information, _ = _normal_equations(matches)
+    spread = VARIANCE_INFLATION * matches.scale**2 * np.linalg.inv(information)
+    covariance = np.asarray(0.5 * (spread + spread.T), dtype=np.float64)
+    sigma = np.sqrt(np.diag(covariance))
+    if float(sigma[:3].max()) > MAX_SIGMA_RAD_S or float(sigma[3:].max()) > MAX_SIGMA_M_S:
+        return MotionUnknown("uncertain")
+    residual = matches.error * matches.sigma
+    return Motion(
+        twist,
+        covariance,
+        overlap=len(matches.tau) / len(later),
+        residual_m=1.4826 * float(np.median(np.abs(residual))),
+        weakest=float(np.linalg.eigvalsh(fit)[0]),
+    )
+
+
+def _searched(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float) -> Twist:
+    """The velocity without turning under which most of what is rare in the scene fits.
+
+    Displacements are tried on a disc that leaves out the most common normal, which is the road's or a
+    wall's: along it a vehicle does not travel, or not far. A surfel counts by how little its normal is
+    shared (its leverage), so that the road, which fits anywhere, does not vote.
+    """
+    held = later.normal.T @ later.normal / len(later)
+    shares, directions = np.linalg.eigh(held)
+    leverage = (((later.normal @ directions) ** 2) / np.maximum(shares, 1e-6)).sum(axis=1)
+    judges = np.argsort(-leverage, kind="stable")[:SEARCH_SURFELS]
+    centre, normal = later.centre[judges], later.normal[judges]
+    steps = math.ceil(SEARCHED_M_S * seconds / SEARCH_STEP_M)
+    grid = np.stack(np.meshgrid(*[np.arange(-steps, steps + 1)] * 2), axis=-1).reshape(-1, 2)
+    grid = grid[np.hypot(grid[:, 0], grid[:, 1]) <= steps]
+    tried = np.asarray(SEARCH_STEP_M * grid @ directions[:, :2].T, dtype=np.float64)
+    cost = np.empty(len(tried))
+    for k, displacement in enumerate(tried):
+        distance, nearest = tree.query(centre + displacement)
+        across = np.einsum(
+            "ij,ij->i", centre + displacement - earlier.centre[nearest], earlier.normal[nearest]
+        )
+        alike = np.abs(np.einsum("ij,ij->i", normal, earlier.normal[nearest])) > ALIKE_COSINE
+        misfit = np.minimum(1.0, (across / (0.5 * SEARCH_STEP_M)) ** 2)
+        misfit[~alike | (distance > np.maximum(earlier.size[nearest], SEARCH_STEP_M))] = 1.0
+        cost[k] = misfit.mean()
+    return Twist(np.zeros(3), tried[int(np.argmin(cost))] / seconds)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpinEvidence:
+    """In which sense the beams went round, told by the bend of the sweeps.
+
+    Attributes:
+        turns: +1 where the sweep was measured counter-clockwise, -1 clockwise, 0 where it is all of one
+            instant (motion compensated, or a flash).
+        sigma: Standard deviation of ``turns``.
+    """
+
+    turns: float
+    sigma: float
+
+
+def spin_evidence(
+    previous: PointCloud | Surfels,
+    current: PointCloud | Surfels,
+    seconds: float,
+    sweep_s: float,
+    axis: Floats,
+    start: Twist | None,
+) -> SpinEvidence | MotionUnknown:
+    """Measures in which sense a moving LiDAR spins, by a seventh unknown of the registration.
+
+    A thing that the vehicle passes is seen in another direction by the later sweep, so at another time of
+    the turn: ``tau = seconds + turns sweep_s (azimuth difference) / 2 pi``. A wrong ``turns`` leaves
+    residuals that grow with the square of the speed: a pair of sweeps at 10 m/s gives it to 0.3, at 3 m/s
+    it gives nothing. Times of the clouds are left aside.
+
+    Args:
+        previous: The earlier sweep, NOT straightened, or its surfels.
+        current: The later sweep, likewise.
+        seconds: Stamp of the later sweep minus that of the earlier, > 0.
+        sweep_s: Duration of a turn, s.
+        axis: float64 (3,), unit, LiDAR frame: the spin axis, upwards.
+        start: The last twist, or None.
+    """
+    earlier = _timeless(previous)
+    later = _timeless(current)
+    motion = estimate_twist(earlier, later, seconds, start)
+    if isinstance(motion, MotionUnknown):
+        return motion
+    tree = cKDTree(earlier.centre)
+    azimuths = [_azimuth(s.centre, axis) for s in (earlier, later)]
+    twist, turns = motion.twist, 0.0
+    for _ in range(ITERATIONS):
+        pairs = _paired(earlier, later, tree, seconds, twist)
+        angle = azimuths[1][pairs[0]] - azimuths[0][pairs[1]]
+        share = angle / _TURN - np.round(angle / _TURN)
+        matches = _compared(earlier, later, pairs, seconds + turns * sweep_s * share, twist)
+        rate = np.cross(twist.omega, matches.moved) + twist.velocity
+        bend = np.einsum("ij,ij->i", matches.normal, rate) * sweep_s * share / matches.sigma
+        J = np.column_stack([_jacobian(matches), bend])
+        weighted = J * matches.weight[:, None]
+        information = weighted.T @ J
+        ridge = 1e-9 * float(np.trace(information)) * np.eye(7)
+        step = -np.linalg.solve(information + ridge, weighted.T @ matches.error)
+        twist = Twist(twist.omega + step[:3], twist.velocity + step[3:6])
+        turns += float(step[6])
+        if float(np.abs(step).max()) < SETTLED:
+            break
+    variance = VARIANCE_INFLATION * matches.scale**2 * float(np.linalg.inv(information + ridge)[6, 6])
+    return SpinEvidence(turns, math.sqrt(variance))
+
+
+def spin_sense(evidence: Sequence[SpinEvidence]) -> SpinSense | Literal["one instant"] | None:
+    """What several pairs of sweeps say together; None while they leave it open.
+
+    The weighted mean must lie nearer to -1, 0 or +1 than to the next of them by three standard deviations,
+    which are widened where the pairs scatter more than they claim.
+    """
+    if len(evidence) < _LEAST_PAIRS:
+        return None
+    turns = np.array([e.turns for e in evidence])
+    weight = np.array([e.sigma for e in evidence]) ** -2.0
+    mean = float(turns @ weight / weight.sum())
+    scatter = float(((turns - mean) ** 2) @ weight) / (len(turns) - 1)
+    nearest = round(mean)
+    if abs(mean - nearest) + _SURE * math.sqrt(max(1.0, scatter) / float(weight.sum())) > _HALF_WAY:
+        return None
+    senses: dict[int, SpinSense | Literal["one instant"]] = {-1: "cw", 0: "one instant", 1: "ccw"}
+    return senses.get(nearest)
+
+
+def _timeless(sweep: PointCloud | Surfels) -> Surfels:
+    found = sweep if isinstance(sweep, Surfels) else surfels(sweep)
+    return dataclasses.replace(found, time=None)
+
+
+def _azimuth(points: Floats, axis: Floats) -> Floats:
+    """Angle (N,) about ``axis``, counter-clockwise from anywhere, rad."""
+    plan = points @ plane_basis(axis).T
+    return np.arctan2(plan[:, 1], plan[:, 0])

@@ -26,7 +26,7 @@ _PLACES_BEFORE = 1
 
 
 class _PairRecord:
-    """What is kept of one pair: the last frame of each state, compressed, and the newest as it came."""
+    """What is kept of one pair: the first healthy frame, the last of each state, and the newest as it came."""
 
     def __init__(self, first: Status) -> None:
         self.history = History(first)
@@ -34,6 +34,7 @@ class _PairRecord:
         self.series = Series(_MOST_SAMPLES)
         self._newest: FrameEvent | None = None
         self._kept: dict[State, KeptFrame] = {}
+        self._before: KeptFrame | None = None
 
     def note(self, status: Status) -> None:
         """Takes the next status."""
@@ -44,8 +45,12 @@ class _PairRecord:
 
     def show(self, frame: FrameEvent) -> None:
         """Takes the next frame."""
-        if frame.T_estimated is not None:
-            self._newest = frame
+        if frame.T_estimated is None:
+            return
+        self._newest = frame
+        # The last healthy frame may be younger than the onset: a drift is told some time after it came.
+        if self._before is None and self.history.last.state == "healthy":
+            self._before = keep(frame)
 
     def telling(self) -> Iterator[tuple[str, KeptFrame, int]]:
         """(title, frame, places) of the frames to show, the most telling first."""
@@ -55,8 +60,8 @@ class _PairRecord:
             told = next(reversed(self._kept), None)
         if told is not None:
             yield f"Stored against estimated, while {told}", self._kept[told], _PLACES
-        if told in ("drifted", "suspect") and "healthy" in self._kept:
-            yield "For comparison, while healthy", self._kept["healthy"], _PLACES_BEFORE
+        if told in ("drifted", "suspect") and self._before is not None:
+            yield "For comparison, when first healthy", self._before, _PLACES_BEFORE
 
     def _keep_newest(self) -> None:
         frame = keep(self._newest) if self._newest is not None else None

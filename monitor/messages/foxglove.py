@@ -11,7 +11,7 @@ from google.protobuf.message import Message as Protobuf
 
 from monitor.messages import CameraInfo, Codec, Decoded, Message, Transform
 from monitor.messages.camera_info import camera_model, rectified_model
-from monitor.messages.image import picture
+from monitor.messages.picture import picture
 from monitor.messages.pixels import Raster, bgr_pixels
 from monitor.messages.point_fields import KNOWN, Field, Packing, cloud_of, packed_columns
 from monitor.messages.ros import NS, frame_name

@@ -199,9 +199,9 @@ def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
     The unit is the first of these in which the points span at most :data:`LONGEST_SWEEP_S`: that of a clock
     counted from 1970, by the size of the numbers (s, ms, us or ns); ns for integers; s, ms, us, ns for
     floats. Clocks from 1970 are told relative to ``stamp_ns``, others count from it. Where that puts the
-    first point further from the stamp than a sweep lasts, the clock is another one (another epoch, the sensor's
-    uptime) and times count from the earliest point. Times that are all equal (a converter's filler), not
-    finite, coarser than :data:`COARSEST_S`, or that make no sweep in any unit say nothing.
+    first point further from the stamp than a sweep lasts, the clock is another one (another epoch, the
+    sensor's uptime) and times count from the earliest point. Times that are all equal (a converter's filler),
+    not finite, coarser than :data:`COARSEST_S`, or that make no sweep in any unit say nothing.
 
     Args:
         values: (N,), any integer or float type.

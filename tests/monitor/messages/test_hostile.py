@@ -126,13 +126,19 @@ def test_every_prefix_ends_in_a_value_or_an_input_error(message):
 
 @pytest.mark.parametrize("message", GOOD, ids=name_of)
 def test_every_flipped_byte_ends_in_a_value_or_an_input_error(message):
+    for at in range(len(message.data)):
+        for flip in (0x01, 0x80, 0xFF):
+            data = bytearray(message.data)
+            data[at] ^= flip
+            survives(message, bytes(data))
+
+
+@pytest.mark.parametrize("message", GOOD, ids=name_of)
+def test_sizes_are_checked_before_anything_is_allocated(message):
     tracemalloc.start()
     try:
-        for at in range(len(message.data)):
-            for flip in (0x01, 0x80, 0xFF):
-                data = bytearray(message.data)
-                data[at] ^= flip
-                survives(message, bytes(data))
+        for at in range(0, len(message.data), 2):
+            survives(message, message.data[:at] + b"\x7f\x7f" + message.data[at + 2 :])
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

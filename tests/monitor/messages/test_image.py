@@ -1,6 +1,7 @@
 import contextlib
 import itertools
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from hypothesis import given
 
 from monitor.messages import Message, decode
-from monitor.messages.image import encode_compressed_image, picture_size
+from monitor.messages.image import encode_compressed_image
+from monitor.messages.picture import picture_size
 from pipeline.errors import InputError
 from tests import strategies
 from tests.monitor.messages import wire
@@ -202,8 +204,25 @@ def test_pictures_of_nothing_are_read_however_small_they_are(suffix, grey):
 def test_a_picture_that_could_not_hold_its_pixels_is_refused_before_it_is_decoded():
     data = bytearray(written("png"))
     data[16:24] = struct.pack(">II", 8000, 8000)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
     with pytest.raises(InputError, match="declares 8000x8000 px"):
         decode(wire.file("png", bytes(data)))
+
+
+@pytest.mark.parametrize("length", [2**20, 2**31, 2**32 - 1])
+def test_a_png_chunk_that_declares_more_than_there_is_is_refused_before_it_is_decoded(length):
+    data = bytearray(written("png"))
+    data[33:37] = struct.pack(">I", length)
+    with pytest.raises(InputError, match="ends before"):
+        decode(wire.file("png", bytes(data)))
+
+
+def test_an_animation_is_refused():
+    data = written("png")
+    chunk = b"acTL" + struct.pack(">II", 1, 0)
+    chunk = struct.pack(">I", 8) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    with pytest.raises(InputError, match="acTL"):
+        decode(wire.file("png", data[:33] + chunk + data[33:]))
 
 
 def test_a_jpeg_that_declares_a_huge_size_is_refused_before_it_is_decoded():

@@ -156,6 +156,23 @@ class TestThresholdsAndSizes:
         assert not masks.pole[:, 300].any()
         assert masks.pole[:, 400].sum() == 24
 
+    def test_a_slanted_line_is_one_piece(self):
+        label = np.where(np.eye(40, dtype=bool), labels.LANE, labels.ROAD)
+        image = np.zeros((40, 40, 3), np.uint8)
+        parameters = MaskParameters(crf=None, lane_least_px2=12.0 * (REFERENCE_WIDTH_PX / 40) ** 2)
+        assert masks_from_probabilities(probabilities_of(label), image, parameters).lane.sum() == 40
+
+    @pytest.mark.parametrize(("factor", "left"), [(1, 12), (2, 48), (3, 108)])
+    def test_least_size_grows_with_the_grid(self, factor, left):
+        # A patch of 12 px at the reference width is 48 px on a grid twice as wide, whatever the image is.
+        label = np.full((20 * factor, REFERENCE_WIDTH_PX * factor), labels.ROAD)
+        label[: 3 * factor, : 4 * factor] = labels.LANE
+        label[8 * factor : 11 * factor, : 4 * factor] = labels.LANE
+        label[8 * factor, 0] = labels.ROAD
+        image = np.zeros((20, REFERENCE_WIDTH_PX, 3), np.uint8)
+        masks = masks_from_probabilities(probabilities_of(label), image, PLAIN)
+        assert masks.lane.sum() == left
+
     def test_masks_share_no_pixel(self):
         stack = np.zeros((len(labels.NAMES), 30, 30), np.float32)
         stack[labels.LANE] = stack[labels.POLE] = 0.5
@@ -209,6 +226,17 @@ class TestHorizon:
         assert not bound.lane[sky].any()
         np.testing.assert_array_equal(bound.lane[sky.stop :], free.lane[sky.stop :])
         np.testing.assert_array_equal(bound.pole, free.pole)
+
+    @pytest.mark.parametrize("scale", [(1.0, 1.0), (0.5, 0.25), (0.25, 0.5)])
+    def test_a_slanted_horizon_on_a_coarse_grid(self, scale):
+        shape = (int(80 * scale[1]), int(120 * scale[0]))
+        line = np.array([-1.0, 1.0, 0.3])
+        parameters = MaskParameters(crf=None, horizon_slack_px=0.0, lane_least_px2=0.0)
+        stack = probabilities_of(np.full(shape, labels.LANE))
+        masks = masks_from_probabilities(stack, np.zeros((80, 120, 3), np.uint8), parameters, line)
+        for row, column in np.ndindex(shape):
+            u, v = (column + 0.5) / masks.scale_x - 0.5, (row + 0.5) / masks.scale_y - 0.5
+            assert masks.lane[row, column] == (line @ [u, v, 1.0] > 0)
 
     def test_slack_is_in_px_of_the_reference_width(self):
         label = np.full((100, REFERENCE_WIDTH_PX * 2), labels.LANE)

@@ -67,8 +67,8 @@ class TestExponential:
     def test_rotation_angle(self, axis, angle):
         base = se3.exp_so3(np.array([0.3, -1.0, 2.0]))
         found = se3.rotation_angle(base, se3.exp_so3(axis * angle) @ base)
-        # The chord is flat at 180 degrees: rounding of 1e-16 there is 2e-8 in the angle.
-        assert found == pytest.approx(angle, abs=1e-14 if angle < 3.0 else 5e-8)
+        # The chord is flat at 180 degrees: rounding of 1e-15 there is 1e-7 in the angle.
+        assert found == pytest.approx(angle, abs=1e-13 if angle < 3.0 else 2e-7)
 
     @given(UNIT, UNIT)
     def test_skew_is_the_cross_product(self, a, b):

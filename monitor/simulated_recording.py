@@ -1,6 +1,7 @@
 """A simulated drive as a recording: MCAP as a vehicle sends it, the stored extrinsic in tf_static.
 
-The truth stands in the metadata record ``calibwatch.simulation``, which no reader of a vehicle's data looks at.
+The truth stands in the metadata record ``calibwatch.simulation``; who reads a vehicle's data does not look
+there.
 """
 
 import json
@@ -56,7 +57,7 @@ class Sent:
 
 
 def static_transforms(parameters: DriveParameters) -> tuple[Transform, Transform]:
-    """What the vehicle states for good: base_link -> lidar and base_link -> camera by the stored extrinsic."""
+    """What the vehicle states for good: base_link -> lidar, base_link -> camera by the stored extrinsic."""
     T_vehicle_lidar = parameters.T_vehicle_lidar
     T_vehicle_camera = T_vehicle_lidar @ inverse(parameters.T_stored)
     return (
@@ -83,7 +84,7 @@ def write_drive(
     path: Path,
     *,
     workers: int = 2,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Simulates a drive and writes it as MCAP, under a temporary name until it is whole.
 
@@ -91,7 +92,7 @@ def write_drive(
         parameters: The drive.
         path: Of the recording.
         workers: Processes that simulate.
-        progress: Called with frames done and frames in all.
+        progress: Called with frames done and frames in all, or None.
 
     Raises:
         InputError: The file can not be written.
@@ -110,7 +111,10 @@ def write_drive(
 
 
 def _write(
-    parameters: DriveParameters, file: BinaryIO, workers: int, progress: Callable[[int, int], None]
+    parameters: DriveParameters,
+    file: BinaryIO,
+    workers: int,
+    progress: Callable[[int, int], None] | None,
 ) -> None:
     writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4)
     writer.start(profile="ros2", library="calibwatch")
@@ -132,9 +136,10 @@ def _write(
                     sequence=counts[sent.topic],
                 )
                 counts[sent.topic] += 1
-            progress(counts[CLOUD_TOPIC], total)
+            if progress is not None:
+                progress(counts[CLOUD_TOPIC], total)
     writer.add_metadata(METADATA, _truth(parameters))
-    writer.finish()
+    writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without a return type
 
 
 def _channel(writer: Writer, topic: str) -> int:

@@ -1,6 +1,7 @@
 """Images by ray casting through the project's own lens models, with the class of every pixel.
 
-Four rays a pixel on a rotated grid: edges of any direction are resolved to a quarter of a pixel.
+Where something ends, a pixel gets four rays on a rotated grid: edges of any direction are resolved to a
+quarter of a pixel. Elsewhere one ray is enough.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pipeline import labels
 from pipeline.cameras import undistort
 from pipeline.errors import InputError
 from pipeline.records import CameraImage, CameraModel, Floats, read_only
-from pipeline.simulation.raycast import Window, cast
+from pipeline.simulation.raycast import Hits, Window, cast
 from pipeline.simulation.scene import Scene
 from pipeline.simulation.shading import View, shade
 from pipeline.simulation.shadows import ShadowMap
@@ -27,6 +28,8 @@ _LENS_STEP_PX = 8
 """px; the inverse lens is computed so often and interpolated by cubics: 1e-8 of the focal length at most."""
 _NEAR_M = 0.05
 """m; solids are cut there to find their place in the image."""
+_TONE_STEP = 0.25
+"""Relative step of brightness between neighbours that counts as a border (window, shadow); grain lies below."""
 _GAMMA = 1.0 / 2.2
 _RANK = np.array([0, 8, 7, 2, 3, 1, 4, 0, 6], dtype=np.int32)
 """Which class wins a pixel that is shared evenly: the thinner one."""
@@ -39,14 +42,19 @@ class Optics:
 
     Attributes:
         camera: Intrinsics.
-        rays: float32 (4,2,H,W), x and y at z = 1 for each pass.
+        rays: float32 (4,2,H,W), x and y at z = 1 for each ray of a pixel.
+        columns: float32 (2,W), least and greatest x of each column.
+        rows: float32 (2,H), least and greatest y of each row.
     """
 
     camera: CameraModel
     rays: F32
+    columns: F32
+    rows: F32
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rays", read_only(self.rays))
+        for name in ("rays", "columns", "rows"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +107,9 @@ def optics_of(camera: CameraModel) -> Optics:
     for p, (du, dv) in enumerate(_GRID):
         for k in range(2):
             rays[p, k] = splines[k](np.arange(camera.width) + du, np.arange(camera.height) + dv).T
-    return Optics(camera, rays)
+    x, y = rays[:, 0], rays[:, 1]
+    columns = np.stack([x.min(axis=(0, 1)), x.max(axis=(0, 1))])
+    return Optics(camera, rays, columns, np.stack([y.min(axis=(0, 2)), y.max(axis=(0, 2))]))
 
 
 def render(
@@ -107,6 +117,7 @@ def render(
     shadows: ShadowMap,
     optics: Optics,
     T_world_cam: Floats,
+    *,
     time: float,
     look: Look,
     rng: np.random.Generator,
@@ -123,23 +134,63 @@ def render(
         rng: Noise.
     """
     solids = scene.solids_at(time)
+    focal = float(optics.camera.K[0, 0])
+    windows = _windows(solids, optics, T_world_cam)
+    rays = _rays(optics.rays[0], T_world_cam)
+    hits = cast(scene, solids, rays, windows)
+    radiance, classes = shade(View(scene, solids, rays, hits, shadows, focal))
+    column, row = np.nonzero(_busy(radiance, classes, hits).T)
+    xy = optics.rays[1:, :, row, column].transpose(1, 2, 0).reshape(2, 1, -1)
+    more = _rays(xy, T_world_cam)
+    more_hits = cast(scene, solids, more, _listed(hits.tested, column))
+    colour, more_classes = shade(View(scene, solids, more, more_hits, shadows, focal))
+    per_pixel = len(_GRID) - 1
+    total = radiance[:, row, column] + colour.reshape(3, -1, per_pixel).sum(axis=2)
+    radiance[:, row, column] = total / np.float32(len(_GRID))
+    votes = np.concatenate([classes[row, column][:, None], more_classes.reshape(-1, per_pixel)], axis=1)
+    classes[row, column] = _voted(votes)
+    return Picture(CameraImage(_developed(radiance, look, rng)), classes)
+
+
+def _rays(xy: F32, T_world_cam: Floats) -> Rays:
+    """Rays through (2,H,W) at z = 1; their parameter is the depth."""
     R = T_world_cam[:3, :3].astype(np.float32)
     x, y, z = (np.full((1, 1), T_world_cam[k, 3], dtype=np.float32) for k in range(3))
-    still = np.zeros((1, 1), dtype=np.float32)
-    windows = _windows(solids, optics, T_world_cam)
-    height, width = optics.rays.shape[2:]
-    radiance = np.zeros((3, height, width), dtype=np.float32)
-    classes = np.empty((len(_GRID), height, width), dtype=np.uint8)
-    for p, offset in enumerate(_GRID):
-        xy = optics.rays[p]
-        direction = np.stack([R[k, 0] * xy[0] + R[k, 1] * xy[1] + R[k, 2] for k in range(3)])
-        rays = Rays((x, y, z), direction, still)
-        hits = cast(scene, solids, rays, windows)
-        jitter = (0.25 * offset[0], 0.25 * offset[1])
-        view = View(scene, solids, rays, hits, shadows, jitter, float(optics.camera.K[0, 0]))
-        colour, classes[p] = shade(view)
-        radiance += np.float32(1.0 / len(_GRID)) * colour
-    return Picture(CameraImage(_developed(radiance, look, rng)), _voted(classes))
+    direction = np.stack([R[k, 0] * xy[0] + R[k, 1] * xy[1] + R[k, 2] for k in range(3)])
+    return Rays((x, y, z), direction, np.zeros((1, 1), dtype=np.float32))
+
+
+def _busy(radiance: F32, classes: NDArray[np.uint8], hits: Hits) -> NDArray[np.bool_]:
+    """Pixels at a border between things, classes or tones: those that need all their rays.
+
+    A border between two samples lies in one of their two pixels. Foliage has no borders within itself.
+    """
+    grey = radiance.sum(axis=0)
+    busy = np.zeros(grey.shape, dtype=np.bool_)
+    whole = slice(None)
+    for a, b in (
+        ((slice(1, None), whole), (slice(None, -1), whole)),
+        ((whole, slice(1, None)), (whole, slice(None, -1))),
+    ):
+        border = hits.what[a] != hits.what[b]
+        border |= np.abs(grey[a] - grey[b]) > _TONE_STEP * np.minimum(grey[a], grey[b])
+        border &= classes[a] != labels.VEGETATION
+        border |= classes[a] != classes[b]
+        busy[a] |= border
+        busy[b] |= border
+    return busy
+
+
+def _listed(windows: tuple[Window, ...], columns: NDArray[np.int64]) -> list[Window]:
+    """The windows of an image as parts of a list of rays, some a pixel, whose pixels are sorted by column."""
+    stops = [(w[2].start, w[2].stop) for w in windows]
+    ends = np.searchsorted(columns, np.array(stops, dtype=np.int64).reshape(-1, 2)) * (len(_GRID) - 1)
+    every = slice(None)
+    return [
+        (w[0], every, slice(int(first), int(last)), w[3])
+        for w, (first, last) in zip(windows, ends, strict=True)
+        if last > first
+    ]
 
 
 def _windows(solids: Solids, optics: Optics, T_world_cam: Floats) -> list[Window]:
@@ -155,9 +206,8 @@ def _windows(solids: Solids, optics: Optics, T_world_cam: Floats) -> list[Window
     xy = points[:, :, :2] / np.where(usable, np.maximum(points[:, :, 2], _NEAR_M), 1.0)[:, :, None]
     low = np.where(usable[:, :, None], xy, np.inf).min(axis=1)
     high = np.where(usable[:, :, None], xy, -np.inf).max(axis=1)
-    x, y = optics.rays[:, 0], optics.rays[:, 1]
-    columns = (x.max(axis=(0, 1)) >= low[:, :1]) & (x.min(axis=(0, 1)) <= high[:, :1])
-    rows = (y.max(axis=(0, 2)) >= low[:, 1:]) & (y.min(axis=(0, 2)) <= high[:, 1:])
+    columns = (optics.columns[1] >= low[:, :1]) & (optics.columns[0] <= high[:, :1])
+    rows = (optics.rows[1] >= low[:, 1:]) & (optics.rows[0] <= high[:, 1:])
     seen = np.flatnonzero(columns.any(axis=1) & rows.any(axis=1))
     near = np.where(usable, points[:, :, 2], np.inf).min(axis=1)
     return [(int(k), _extent(rows[k]), _extent(columns[k]), float(near[k])) for k in seen]
@@ -167,11 +217,11 @@ def _extent(flags: NDArray[np.bool_]) -> slice:
     return slice(int(np.argmax(flags)), len(flags) - int(np.argmax(flags[::-1])))
 
 
-def _voted(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The class with most rays in each pixel, the thinner one of equals."""
-    score = np.stack([16 * (classes == k).sum(axis=0) + _RANK[k] for k in range(len(labels.NAMES))])
-    # A class without a ray must not win by its rank.
-    return np.argmax(np.where(score >= 16, score, -1), axis=0).astype(np.uint8)
+def _voted(votes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The class with most votes in each row of (N,4), the thinner one of equals."""
+    score = np.stack([16 * (votes == k).sum(axis=1) + _RANK[k] for k in range(len(labels.NAMES))])
+    # A class without a vote must not win by its rank.
+    return np.asarray(np.argmax(np.where(score >= 16, score, -1), axis=0), dtype=np.uint8)
 
 
 def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -186,7 +236,7 @@ def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[n
     grain = rng.standard_normal(grey.shape, dtype=np.float32)
     # Shot noise after the tone curve: about even over the grey levels, a little stronger in the dark.
     grey += np.float32(look.noise) * grain * (1.2 - grey * np.float32(0.4 / 255.0))
-    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
 
 
 def _exposure(light: F32, target: float) -> np.float32:

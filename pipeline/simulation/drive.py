@@ -19,6 +19,8 @@ START_NS = 1_700_000_000_000_000_000
 """ns; stamp of time 0, some day, so that nothing may take a stamp for a duration."""
 _VIEW_M = 130.0
 """m; how far ahead shadows are drawn."""
+_END_M = 10.0
+"""m; the belt of trees at the end may come so near: it closes the view as well as a street."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +89,8 @@ class DriveParameters:
         exposure: Of the camera after the start of a sweep, s.
         T_vehicle_lidar: float64 (4,4), maps LiDAR to vehicle (x forward, y left, z up, origin on the ground).
         T_stored: float64 (4,4), the extrinsic T_cam_lidar that the vehicle believes in, true until the drift.
-        drift: float64 (6,), motion of the camera mount in vehicle axes (roll, pitch, yaw rad, forward, left, up m)
-            with the signs of FORMULAS A4.
+        drift: float64 (6,), motion of the camera mount in vehicle axes (roll, pitch, yaw rad, forward, left,
+            up m) with the signs of FORMULAS A4.
         drift_time: When it happens, s; inf: never.
     """
 
@@ -109,9 +111,10 @@ class DriveParameters:
         for name in ("T_vehicle_lidar", "T_stored", "drift"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
         way = float(self.motion.along(np.array(self.duration)))
-        if way + _VIEW_M - 10.0 > self.scene.length:
+        if way + _VIEW_M - _END_M > self.scene.length:
+            needed = way + _VIEW_M - _END_M
             raise InputError(
-                f"the drive is {way:.0f} m long and needs 120 m more to look at, the street has {self.scene.length:.0f} m",
+                f"a drive of {way:.0f} m needs a street of {needed:.0f} m, it has {self.scene.length:.0f} m",
                 hint="a longer SceneParameters.length or a shorter duration",
             )
 
@@ -208,7 +211,9 @@ class Drive:
         T_cam_lidar = self.T_cam_lidar(exposed)
         at_exposure = np.array([exposed])
         T_world_cam = self.T_world_lidar(at_exposure)[0] @ inverse(T_cam_lidar)
-        picture = render(self.scene, self._shadows, self._optics, T_world_cam, exposed, p.look, camera_rng)
+        picture = render(
+            self.scene, self._shadows, self._optics, T_world_cam, time=exposed, look=p.look, rng=camera_rng
+        )
         return DriveFrame(
             index,
             cloud,

@@ -1,7 +1,8 @@
-"""The things that stand in a street, each as a list of solids: poles, signs, trees, buildings, vehicles, people.
+"""What stands in a street, each thing as a list of solids: poles, signs, trees, buildings, vehicles, people.
 
 Every function takes the place on the ground (3,), the heading there in rad and a generator for the details.
 """
+# ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
 
@@ -40,7 +41,13 @@ def _pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float =
     return (min(b * k, 0.9), min(g * k, 0.9), min(r * k, 0.9))
 
 
-def _bar(start: Floats, end: Floats, radius: float, label: int, colour: Colour, reflectance: float) -> Solid:
+def _up(height: float) -> Floats:
+    return np.array([0.0, 0.0, height])
+
+
+def _bar(
+    start: Floats, end: Floats, radius: float, label: int, colour: Colour, *, reflectance: float
+) -> Solid:
     """A cylinder between two points."""
     axis = (end - start) / np.linalg.norm(end - start)
     side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
@@ -56,7 +63,7 @@ def post(
     """A bare pole; ``lean`` forward and left in rad of the world's axes."""
     axes = upright(0.0, lean)
     foot = ground - 0.2 * axes[:, 2]
-    return _bar(foot, ground + height * axes[:, 2], radius, labels.POLE, colour, 0.35)
+    return _bar(foot, ground + height * axes[:, 2], radius, labels.POLE, colour, reflectance=0.35)
 
 
 def lamp_post(
@@ -70,7 +77,7 @@ def lamp_post(
         return [mast]
     top = mast.centre + mast.axes[:, 2] * mast.half[2]
     inward = -side * np.array([-math.sin(heading), math.cos(heading), 0.0])
-    end = top + inward * rng.uniform(0.8, 1.8) + [0.0, 0.0, 0.15]
+    end = top + inward * rng.uniform(0.8, 1.8) + _up(0.15)
     head = Solid(
         Shape.BOX,
         end,
@@ -80,7 +87,7 @@ def lamp_post(
         colour,
         0.3,
     )
-    return [mast, _bar(top, end, 0.045, labels.POLE, colour, 0.35), head]
+    return [mast, _bar(top, end, 0.045, labels.POLE, colour, reflectance=0.35), head]
 
 
 def sign_post(
@@ -120,7 +127,7 @@ def traffic_light(ground: Floats, heading: float, rng: np.random.Generator) -> l
     """A signal on a post of 3 to 3.5 m."""
     height = float(rng.uniform(3.0, 3.5))
     mast = post(ground, height, 0.07, (0.0, 0.0), (0.10, 0.12, 0.10))
-    centre = ground + [0.0, 0.0, height - 0.5] - 0.2 * np.array([math.cos(heading), math.sin(heading), 0.0])
+    centre = ground + _up(height - 0.5) - 0.2 * np.array([math.cos(heading), math.sin(heading), 0.0])
     axes = upright(heading)
     dark = Solid(Shape.BOX, centre, axes, np.array([0.14, 0.16, 0.45]), labels.SIGN, (0.02, 0.02, 0.02), 0.15)
     lit = int(rng.integers(3))
@@ -143,9 +150,8 @@ def tree(ground: Floats, rng: np.random.Generator) -> list[Solid]:
     height, radius = float(rng.uniform(2.0, 3.2)), float(rng.uniform(0.1, 0.25))
     lean = tuple(rng.normal(0.0, 0.04, 2))
     up = upright(0.0, (float(lean[0]), float(lean[1])))[:, 2]
-    trunk = _bar(
-        ground - 0.2 * up, ground + (height + 1.0) * up, radius, labels.VEGETATION, (0.05, 0.08, 0.11), 0.3
-    )
+    foot, fork = ground - 0.2 * up, ground + (height + 1.0) * up
+    trunk = _bar(foot, fork, radius, labels.VEGETATION, (0.05, 0.08, 0.11), reflectance=0.3)
     crown = float(rng.uniform(1.4, 2.8))
     middle = ground + (height + 0.8 * crown) * up
     green = _pick(rng, ((0.03, 0.12, 0.05), (0.02, 0.09, 0.06), (0.03, 0.14, 0.10)), 0.3)
@@ -155,7 +161,7 @@ def tree(ground: Floats, rng: np.random.Generator) -> list[Solid]:
 def bush(ground: Floats, size: float, rng: np.random.Generator) -> list[Solid]:
     """A bush of two or three balls."""
     green = _pick(rng, ((0.03, 0.11, 0.05), (0.03, 0.09, 0.07)), 0.3)
-    return _foliage(ground + [0.0, 0.0, 0.6 * size], np.array([size, size, 0.7 * size]), 2, green, rng)
+    return _foliage(ground + _up(0.6 * size), np.array([size, size, 0.7 * size]), 2, green, rng)
 
 
 def _foliage(
@@ -220,7 +226,7 @@ def panel(
     hedge = label == labels.VEGETATION
     return Solid(
         Shape.BOX,
-        ground + [0.0, 0.0, height / 2 - 0.2],
+        ground + _up(height / 2 - 0.2),
         upright(heading),
         np.array([length / 2, thickness / 2, height / 2 + 0.2]),
         label,
@@ -331,6 +337,14 @@ def person(ground: Floats, rng: np.random.Generator) -> list[Solid]:
     )
     scale = np.array([1.0, 1.0, height])
     return [
-        Solid(shape, ground + axes @ (scale * centre), axes, scale * half, labels.OTHER, colour, 0.35)
+        Solid(
+            shape,
+            ground + axes @ (scale * centre),
+            axes,
+            scale * half,
+            labels.OTHER,
+            colour,
+            reflectance=0.35,
+        )
         for centre, half, colour, shape in shapes
     ]

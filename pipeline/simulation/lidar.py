@@ -29,8 +29,8 @@ class LidarModel:
         clockwise: Seen from above (+z).
         start: Azimuth of the first column, rad.
         sigma: Range noise, m.
-        reach: Range at which a surface of reflectance 0.1 gives half of its returns, m; it grows with the root of the
-            reflectance.
+        reach: Range at which a surface of reflectance 0.1 gives half of its returns, m; it grows with the
+            root of the reflectance.
         loss: Share of returns lost at random.
     """
 
@@ -88,8 +88,8 @@ def sweep(
         rng: Noise of range, reflectance and losses.
 
     Returns:
-        Points in the LiDAR frame, each of its own moment (not motion compensated), in order of firing; ``time`` counts
-        from ``start_time``; ``ring`` is the index of the elevation.
+        Points in the LiDAR frame, each of its own moment (not motion compensated), in order of firing;
+        ``time`` counts from ``start_time``; ``ring`` is the index of the elevation.
     """
     times = model.times
     middle = start_time + model.period / 2
@@ -204,7 +204,7 @@ def _returns(
     flat = rings * shape[1] + columns
     distance = hits.t.ravel()[flat] + model.sigma * noise[0].ravel()[flat]
     xyz = beams.reshape(3, -1)[:, flat].T * distance[:, None]
-    # Sensors level out most of the incidence; what is left, and speckle, is why single points of paint and road overlap.
+    # Sensors level out most of the incidence; what is left, and speckle, makes paint and road overlap.
     level = reflectance.ravel()[flat] * (0.75 + 0.25 * cosine.ravel()[flat])
     intensity = level * (1.0 + 0.12 * noise[1].ravel()[flat]) + 0.02 * noise[1].ravel()[flat]
     return PointCloud(

@@ -11,7 +11,7 @@ from pipeline.simulation.solids import Shape, Solids
 from pipeline.simulation.surface import F32, Rays
 
 Window: TypeAlias = tuple[int, slice, slice, float]
-"""Index of a solid, the rows and columns of the grid it may cover, and a lower bound of t where rays meet it."""
+"""Index of a solid, rows and columns of the grid that it may cover, and a lower bound of t on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,10 +21,12 @@ class Hits:
     Attributes:
         t: float32 (H,W), parameter along the ray; inf for the sky.
         what: int32 (H,W), index of the solid, or SKY, ROAD, RAISED, KERB of ``surface``.
+        tested: Windows of the solids that do not stand wholly behind nearer ones.
     """
 
     t: F32
     what: NDArray[np.int32]
+    tested: tuple[Window, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,16 +58,19 @@ def cast(scene: Scene, solids: Solids, rays: Rays, windows: list[Window]) -> Hit
         windows: For each solid in view the part of the grid that may see it; a solid may come more than once.
     """
     t, what = scene.surface.meet(rays)
-    for index, rows, columns, bound in sorted(windows, key=lambda w: w[3]):
+    tested: list[Window] = []
+    for window in sorted(windows, key=lambda w: w[3]):
+        index, rows, columns, bound = window
         nearest = t[rows, columns]
         # From near to far: what stands wholly behind what was met already is not tested.
         if float(nearest.max()) < bound:
             continue
+        tested.append(window)
         met = solids.meet(index, rays, (rows, columns), scene.textures.grain)
         closer = met < nearest
         np.copyto(nearest, met, where=closer)
         what[rows, columns][closer] = index
-    return Hits(t, what)
+    return Hits(t, what, tuple(tested))
 
 
 def places(rays: Rays, hits: Hits, pixels: NDArray[np.int64]) -> F32:

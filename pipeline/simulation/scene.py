@@ -1,4 +1,5 @@
-"""A street drawn from a seed: ground, paint, furniture, buildings, trees, parked and moving vehicles, light."""
+"""A street drawn from a seed: ground, paint, furniture, buildings, trees, vehicles that park or move, light."""
+# ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
 from dataclasses import dataclass
@@ -308,7 +309,7 @@ def _background(
 def _raised(solid: Solid, height: float) -> Solid:
     return Solid(
         solid.shape,
-        solid.centre + [0.0, 0.0, height],
+        solid.centre + np.array([0.0, 0.0, height]),
         solid.axes,
         solid.half,
         solid.label,

@@ -1,4 +1,5 @@
-"""Colour and class of what rays of the camera met: materials, light, shadow, haze, sky. Colours are linear BGR."""
+"""Colour and class of what rays of the camera met: materials, light, shadow, haze, sky; linear BGR."""
+# ruff: noqa: PLR2004 - the figures are patterns on surfaces, in the units of the coordinate beside them
 
 from dataclasses import dataclass
 
@@ -32,7 +33,6 @@ class View:
         rays: Rays with direction z_cam = 1, so that t is the depth.
         hits: What they met.
         shadows: Of what stands still.
-        jitter: Shift of the shadow map in this pass, m.
         focal: px.
     """
 
@@ -41,7 +41,6 @@ class View:
     rays: Rays
     hits: Hits
     shadows: ShadowMap
-    jitter: tuple[float, float]
     focal: float
 
 
@@ -83,7 +82,8 @@ def _sky(view: View, pixels: NDArray[np.int64]) -> F32:
 def _detail(view: View, pixels: NDArray[np.int64], cell: float) -> F32:
     """Share 0..1 of a texture of so large cells (m) that a pixel on the ground resolves."""
     t = view.hits.t.ravel()[pixels]
-    return np.minimum(np.float32(2.0 * cell * view.focal * 1.5) / (t * t + 1e-6), np.float32(1.0))
+    resolved = np.float32(2.0 * cell * view.focal * 1.5) / (t * t + 1e-6)
+    return np.asarray(np.minimum(resolved, 1.0), dtype=np.float32)
 
 
 def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint8]]:
@@ -114,15 +114,15 @@ def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint
     fresh = np.clip(1.0 - worn, 0.25, 1.0)
     albedo[:, painted] = fresh * np.float32(_PAINT_ALBEDO) + (1.0 - fresh) * albedo[:, painted]
     classes[painted] = labels.LANE
-    lit = view.shadows.lit(place, view.jitter)
-    lit &= ~shaded_by_movers(place, view.solids, len(scene.standing), scene.light, noise.grain)
+    lit = view.shadows.lit(place)
+    lit *= ~shaded_by_movers(place, view.solids, len(scene.standing), scene.light, noise.grain)
     facing = np.full(pixels.size, scene.light.sun[2], dtype=np.float32)
     facing[kerb] *= np.float32(0.6)
     light = _light(view, facing, lit, np.ones(pixels.size, dtype=np.float32))
     return _hazed(view, pixels, albedo * light), classes
 
 
-def _light(view: View, facing: F32, lit: NDArray[np.bool_], open_sky: F32) -> F32:
+def _light(view: View, facing: F32, lit: F32, open_sky: F32) -> F32:
     """Irradiance (3,N) from sun and sky; ``open_sky`` is the share of the sky that the surface sees."""
     light = view.scene.light
     direct = np.float32(light.direct) * np.maximum(facing, np.float32(0.0)) * lit
@@ -151,7 +151,7 @@ def _solids(view: View, points: SolidPoints) -> F32:
     _plate(points, albedo, np.flatnonzero(material == Material.PLATE))
     facing = np.einsum("i,in->n", scene.light.sun.astype(np.float32), points.normal)
     facing = np.where(leaves, 0.35 + 0.65 * facing, facing)
-    lit = view.shadows.lit(points.place + np.float32(0.25) * points.normal, view.jitter)
+    lit = view.shadows.lit(points.place + np.float32(0.25) * points.normal)
     open_sky = 0.6 + 0.4 * points.normal[2]
     return _hazed(view, points.pixels, albedo * _light(view, facing, lit, open_sky.astype(np.float32)))
 

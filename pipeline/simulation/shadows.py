@@ -12,7 +12,7 @@ from pipeline.simulation.solids import Solids
 from pipeline.simulation.surface import F32, Rays
 
 CELL_M = 0.2
-"""m; finer than the penumbra of a lamp post's top (the sun is 0.53 degrees wide: 7 cm at 8 m) does not show."""
+"""m; finer than the penumbra of a lamp post (the sun is 0.53 degrees wide: 7 cm at 8 m) is no gain."""
 _ASIDE_M = 45.0
 """m; how far from the road shadows are drawn."""
 _ABOVE_M = 200.0
@@ -40,13 +40,25 @@ class ShadowMap:
     def __post_init__(self) -> None:
         object.__setattr__(self, "top", read_only(self.top))
 
-    def lit(self, place: F32, jitter: tuple[float, float]) -> NDArray[np.bool_]:
-        """Whether the sun reaches points (3,N), m, world; the jitter (m) softens the edge over several passes."""
-        x = place[0] + np.float32(self.slide[0]) * place[2] + np.float32(jitter[0] - self.corner[0])
-        y = place[1] + np.float32(self.slide[1]) * place[2] + np.float32(jitter[1] - self.corner[1])
-        i = np.clip(x * np.float32(1.0 / CELL_M), 0, self.top.shape[0] - 1).astype(np.int32)
-        j = np.clip(y * np.float32(1.0 / CELL_M), 0, self.top.shape[1] - 1).astype(np.int32)
-        return np.asarray(self.top[i, j] < place[2] + np.float32(_BIAS_M))
+    def lit(self, place: F32) -> F32:
+        """Share 0..1 of the sun that reaches points (3,N), m, world: float32 (N,), even between cells."""
+        x = (place[0] + np.float32(self.slide[0]) * place[2] - np.float32(self.corner[0])) / np.float32(
+            CELL_M
+        )
+        y = (place[1] + np.float32(self.slide[1]) * place[2] - np.float32(self.corner[1])) / np.float32(
+            CELL_M
+        )
+        x = np.clip(x - np.float32(0.5), 0, self.top.shape[0] - 2)
+        y = np.clip(y - np.float32(0.5), 0, self.top.shape[1] - 2)
+        i, j = x.astype(np.int32), y.astype(np.int32)
+        a, b = x - i, y - j
+        corner = i * self.top.shape[1] + j
+        top, z = self.top.ravel(), place[2] + np.float32(_BIAS_M)
+        first, second = (
+            (top[corner + row] < z) * (1 - b) + (top[corner + row + 1] < z) * b
+            for row in (0, self.top.shape[1])
+        )
+        return np.asarray(first * (1 - a) + second * a, dtype=np.float32)
 
 
 def shadow_map(scene: Scene, reach: tuple[float, float]) -> ShadowMap:
@@ -92,7 +104,7 @@ def _windows(
 
 
 def shaded_by_movers(place: F32, solids: Solids, first: int, light: Light, grain: F32) -> NDArray[np.bool_]:
-    """Whether points (3,N) lie in the shadow of the solids from index ``first`` on (those of the vehicles)."""
+    """Whether points (3,N) lie in the shadow of solids from index ``first`` on (those that move)."""
     shaded = np.zeros(place.shape[1], dtype=np.bool_)
     for index in range(first, len(solids)):
         centre = solids.centre[index].astype(np.float32)

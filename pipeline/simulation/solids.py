@@ -165,7 +165,7 @@ class Solids:
         return np.where(met, enter, np.float32(np.inf))
 
     def _start(self, index: int, rays: Rays, window: tuple[slice, slice]) -> tuple[F32, F32, F32]:
-        """Origins of the rays in the unit frame of the solid, as three arrays that broadcast to the window."""
+        """Origins of the rays in the unit frame, as three arrays that broadcast to the window."""
         full = rays.direction.shape[1:]
         A, centre, velocity = self.to_unit[index], self.centre[index], self.velocity[index]
         rel = [_cut(rays.origin[k], full, window) - centre[k] for k in range(3)]
@@ -180,7 +180,7 @@ class Solids:
     def _leafy(
         self, index: int, start: tuple[F32, F32, F32], u: F32, chord: tuple[F32, F32], grain: F32
     ) -> NDArray[np.bool_]:
-        """Whether a ray that enters a crown meets a leaf: always in the middle, by the grain towards the rim."""
+        """Whether a ray that enters a crown meets a leaf: in the middle always, by the grain at the rim."""
         enter, leave = chord
         half = 0.5 * (leave - enter) * np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
         sure = ~(half < _RAGGED)
@@ -191,9 +191,8 @@ class Solids:
         place = [np.broadcast_to(start[i], half.shape)[rim] + t * u[i][rim] for i in range(3)]
         row = ((place[0] + place[1]) * np.float32(scale[0])).astype(np.int32) + 37 * index
         column = ((place[2] + 0.3 * place[1]) * np.float32(scale[2])).astype(np.int32)
-        leafy = sure
-        leafy[rim] = half[rim] > _RAGGED * grain[row & k, column & k]
-        return leafy
+        sure[rim] = half[rim] > _RAGGED * grain[row & k, column & k]
+        return np.asarray(sure)
 
 
 def _cut(values: F32, full: tuple[int, ...], window: tuple[slice, slice]) -> F32:

@@ -1,7 +1,7 @@
-"""The ground: a road along a chain of clothoids with grades, kerbs, pavements and verges, and where rays meet it.
+"""The ground: a road of clothoids with grades, kerbs, pavements and verges, and where rays meet it.
 
-The world's x axis runs roughly along the road (heading below 45 degrees), so that centre line, arc length and height
-are functions of x and rays meet the ground in closed form. Heights change along x only.
+The world's x axis runs roughly along the road (heading below 45 degrees), so that centre line, arc length
+and height are functions of x and rays meet the ground in closed form. Heights change along x only.
 """
 
 import math
@@ -92,8 +92,8 @@ class RoadSurface:
     def road_coordinates(self, x: F32, y: F32) -> tuple[F32, F32]:
         """Arc length s and distance d to the left of the centre line, m, float32, of points on the ground.
 
-        d is the distance along y times the cosine of the heading: exact for straight roads and by definition here,
-        since paint and kerbs are drawn in these coordinates.
+        d is the distance along y times the cosine of the heading: exact for straight roads and by definition
+        here, since paint and kerbs are drawn in these coordinates.
         """
         cell, weight = self._cell(x)
         sine, cosine = np.sin(self.heading), np.cos(self.heading)
@@ -142,9 +142,10 @@ class RoadSurface:
     def _meet_height(self, rays: Rays, raised: float) -> F32:
         """First t at which each ray comes down to the height of the road plus ``raised``.
 
-        The ground is a cylinder over x: the ray with slope m = dz/|dx| meets it where the running maximum of the
-        slopes to the ground's vertices first reaches m, which a binary search finds. Rays that start elsewhere than
-        their mean (a moving LiDAR) are put right by repeating the last, linear step from their own start.
+        The ground is a cylinder over x: the ray with slope m = dz/|dx| meets it where the running maximum of
+        the slopes to the ground's vertices first reaches m, which a binary search finds. Rays that start
+        elsewhere than their mean (a moving LiDAR) are put right by repeating the last, linear step from their
+        own start.
         """
         x = np.concatenate([[-_FAR_M], self.x, [_FAR_M]])
         h = np.concatenate([self.height[:1], self.height, self.height[-1:]]) + raised

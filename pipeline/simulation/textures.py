@@ -16,9 +16,9 @@ class Textures:
     """Noise tables.
 
     Attributes:
-        rough: float32 (SIZE,SIZE), power falling as 1/f, mean 0, standard deviation 1, within +-2.5: soft patches.
+        rough: float32 (SIZE,SIZE), power falling with frequency, mean 0, deviation 1, in +-2.5: soft patches.
         fine: As ``rough``, but nearly white: grain.
-        grain: float32 (SIZE,SIZE), uniform in 0..1 after ranking ``rough`` mixed with grain: where leaves are.
+        grain: float32 (SIZE,SIZE), ranks of a noise, uniform in 0..1: where leaves are.
     """
 
     rough: F32
@@ -52,4 +52,4 @@ def sample(table: F32, u: F32, v: F32, cells_per_unit: float) -> F32:
     k = np.float32(cells_per_unit)
     i = np.floor(u * k).astype(np.int32) & (SIZE - 1)
     j = np.floor(v * k).astype(np.int32) & (SIZE - 1)
-    return table[i, j]
+    return np.asarray(table[i, j], dtype=np.float32)

@@ -1,4 +1,5 @@
 """Streets, cameras, light and sensors of all kinds, drawn from a seed: what a network should have seen."""
+# ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
 from dataclasses import dataclass
@@ -105,4 +106,4 @@ def picture(variety: Variety, rng: np.random.Generator) -> tuple[Picture, Scene]
     T_world_cam = transform(R @ AXES_CAM_IN_VEHICLE, place + R[:, 2] * variety.height)
     shadows = shadow_map(scene, (float(place[0]) - 20.0, float(place[0]) + 120.0))
     optics = optics_of(variety.camera)
-    return render(scene, shadows, optics, T_world_cam, 0.0, variety.look, rng), scene
+    return render(scene, shadows, optics, T_world_cam, time=0.0, look=variety.look, rng=rng), scene

@@ -24,7 +24,8 @@ _DARK_BGR = (20, 20, 20)
 _IMAGE_LINE_BGR = (255, 255, 255)
 
 _KEPT_JPEG_QUALITY = 92
-_SHOWN_JPEG_QUALITY = 82
+_CROP_JPEG_QUALITY = 82
+_OVERVIEW_JPEG_QUALITY = 68
 _MOST_POINTS = 20_000
 """points kept of a frame: enough for every place, 240 kB."""
 _CROPS_ACROSS = 6
@@ -227,7 +228,7 @@ def _drawn(
         centre = (int(point[0]), int(point[1]))
         cv2.circle(canvas, centre, 56, _DARK_BGR, -1, cv2.LINE_AA, 4)
         cv2.circle(canvas, centre, 40, colour, -1, cv2.LINE_AA, 4)
-    return _jpeg(np.asarray(canvas, dtype=np.uint8), _SHOWN_JPEG_QUALITY)
+    return _jpeg(np.asarray(canvas, dtype=np.uint8), _CROP_JPEG_QUALITY)
 
 
 def _samples(start: Floats, end: Floats) -> Floats:
@@ -253,7 +254,7 @@ def _overview(image: Pixels, stored: Floats, estimated: Floats, places: tuple[Pl
         cv2.putText(
             canvas, str(number), where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, _IMAGE_LINE_BGR, 1, cv2.LINE_AA
         )
-    return _jpeg(np.asarray(canvas, dtype=np.uint8), _SHOWN_JPEG_QUALITY)
+    return _jpeg(np.asarray(canvas, dtype=np.uint8), _OVERVIEW_JPEG_QUALITY)
 
 
 def _jpeg(pixels: Pixels, quality: int) -> bytes:

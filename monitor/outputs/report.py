@@ -1,6 +1,7 @@
 """``report.html``: one self-contained page that a person opens: verdict, plots, overlays, what to do next."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from monitor.events import EndEvent, Event, FrameEvent, StatusEvent
@@ -26,7 +27,7 @@ _PLACES_BEFORE = 1
 
 
 class _PairRecord:
-    """What is kept of one pair: the first healthy frame, the last of each state, and the newest as it came."""
+    """What is kept of one pair: the first healthy frame, the last of each state, the newest as it came."""
 
     def __init__(self, first: Status) -> None:
         self.history = History(first)
@@ -121,7 +122,7 @@ class Report:
 
 
 def _pictures(records: list[_PairRecord]) -> tuple[list[list[tuple[str, Overlay]]], list[int]]:
-    """Overlays per pair as far as the page may grow, the most telling of every pair first."""
+    """Overlays per pair as far as the page may grow: the most telling frame of every pair comes first."""
     shown: list[list[tuple[str, Overlay]]] = [[] for _ in records]
     left_out = [0] * len(records)
     room = _PICTURES_BYTES
@@ -130,17 +131,27 @@ def _pictures(records: list[_PairRecord]) -> tuple[list[list[tuple[str, Overlay]
         for index, record in enumerate(records)
         for rank, (title, frame, places) in enumerate(record.telling())
     ]
-    for _, index, title, frame, places in sorted(wanted, key=lambda want: want[:2]):
-        for fewer in range(places, 0, -1):
-            drawn = overlay(frame, fewer)
-            size = picture_bytes(drawn)
-            if size <= room:
-                room -= size
-                shown[index].append((title, drawn))
-                break
-        else:
+    wanted.sort(key=lambda want: want[:2])
+    for served, (rank, index, title, frame, places) in enumerate(wanted):
+        waiting = sum(other[0] == rank for other in wanted[served:])
+        drawn = _within(room // waiting, overlay(frame, places), frame)
+        if drawn is None:
             left_out[index] += 1
+        else:
+            room -= picture_bytes(drawn)
+            shown[index].append((title, drawn))
     return shown, left_out
+
+
+def _within(room: int, drawn: Overlay, frame: KeptFrame) -> Overlay | None:
+    """The overlay with as many places as fit into ``room`` bytes; None where not even one does."""
+    if picture_bytes(drawn) <= room:
+        return drawn
+    for places in range(len(drawn.crops) - 1, 0, -1):
+        fewer = replace(drawn, crops=drawn.crops[:places])
+        if picture_bytes(fewer) <= room:
+            return overlay(frame, places)  # drawn again: the overview marks the places that are shown
+    return None
 
 
 OUTPUT = OutputKind(

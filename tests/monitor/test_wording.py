@@ -71,8 +71,8 @@ def test_drifted_names_axis_size_sigma_limit_since_when_and_what_was_not_checked
     )
     assert said == (
         "front is drifted (major): yaw -0.81 deg (sigma 0.04 deg, limit 0.50 deg), since 2011-09-26 "
-        "13:02:26.0 UTC (between 2011-09-26 13:02:25.0 and 13:02:28.0 UTC); not checked: forward (not observable); "
-        "left (too uncertain to exclude a drift of the limit)."
+        "13:02:26.0 UTC (between 2011-09-26 13:02:25.0 and 13:02:28.0 UTC); not checked: "
+        "forward (not observable); left (too uncertain to exclude a drift of the limit)."
     )
 
 

@@ -7,6 +7,7 @@ A rig comes from a rig file (TOML or JSON), from ``calib.json``, or from what a 
 import dataclasses
 import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -46,6 +47,8 @@ IMAGE_SUFFIXES = ("png", "jpg")
 
 _ROUNDING = 1e-3
 """Largest entry of ``R R^T - I`` that passes as rounding: six digits give 1e-5, a wrong matrix far more."""
+_RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
+"""Chunks of topics that hold rectified images: image_rect, image_rect_color, image_rectified."""
 _LARGEST_FILE = 8 << 20
 """bytes; a rig file is a few kB."""
 
@@ -353,7 +356,7 @@ def camera_from_info(info: CameraInfo, *, rectified: bool | None, topic: str) ->
         RigError: The rig says rectified but the message has no P.
     """
     said = rectified is not None
-    by_name = any("rect" in chunk and "unrect" not in chunk for chunk in topic.split("/"))
+    by_name = any(_RECTIFIED.search(chunk) for chunk in topic.split("/"))
     if rectified if said else (by_name and info.rectified is not None):
         if info.rectified is None:
             raise RigError(

@@ -2,8 +2,8 @@
 
 Further cameras have their own ``calib_<CAMERA>.json`` with their own frames; the pair is then called like
 the camera. Pairs are given, not searched: cloud n and image n of a pair carry the sequence number n, and the
-rig of the folder says ``pairing = "sequence"``, so that stamps which differ by more than the gap limit (or are
-absent) part nothing.
+rig of the folder says ``pairing = "sequence"``, so that stamps that differ by more than the gap limit part
+nothing, nor do absent ones.
 """
 
 import re

@@ -313,7 +313,8 @@ class McapKind:
     def matches(self, location: str) -> bool:
         """A file that is called .mcap or starts like one."""
         path = Path(location)
-        return path.suffix.lower() == ".mcap" or (path.is_file() and starts_with(path, MAGIC))
+        named = path.suffix.lower() == ".mcap" and not path.is_dir()
+        return named or (path.is_file() and starts_with(path, MAGIC))
 
     def open(self, location: str) -> McapFile:
         """Opens the file."""

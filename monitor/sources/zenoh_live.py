@@ -1,9 +1,9 @@
 """zenoh: sensor messages as they come (DESIGN 6), from rmw_zenoh, zenoh-bridge-ros2dds or what names types.
 
-Every subscription has a ring of its own, so that a slow reader never holds back the session, and a thread that
-takes from it into the inbox, which is bounded per topic and counts what it drops. What the rings overwrite
-shows as gaps in the publisher's sequence number (attachment of rmw_zenoh, else number of an AdvancedPublisher),
-else, estimated, in the stamps.
+Every subscription has a ring of its own, so that a slow reader never holds back the session, and a thread
+that takes from it into the inbox, which is bounded per topic and counts what it drops. What the rings
+overwrite shows as gaps in the publisher's sequence number (attachment of rmw_zenoh, else the number that an
+AdvancedPublisher gives), else, estimated, in the stamps.
 """
 
 import logging
@@ -227,7 +227,7 @@ class ZenohLive:
             for sample in samples:
                 if sample.kind == zenoh.SampleKind.PUT:
                     self._take(sample, reader)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - top of a thread: reported, and the input ends
             _log.exception("an input of the bus ended")
             self._inbox.lose("input_ended", note=f"{threading.current_thread().name} ended: {error}")
 

@@ -34,7 +34,7 @@ _CROP_SHAPE = 1.4
 """width / height of a crop."""
 _CROP_SHOWN_PX = 460
 """px; width of a crop as it is shown."""
-_OVERVIEW_PX = 960
+_OVERVIEW_PX = 860
 """px; largest width of the overview."""
 _ENOUGH_POINTS = 30
 """points in a crop beyond which more do not make it better to judge."""

@@ -22,6 +22,8 @@ MIN_LENGTH_PX = 25.0
 """px; shorter strokes have no direction: 0.5 px at each end are 1.6 deg."""
 HOUGH_GAP_PX = 6.0
 """px; holes in a mask that do not end a stroke."""
+CORE = 0.5
+"""Of the depth of a stroke; what lies deeper is its core, in which straight pieces are sought."""
 MIN_FRESH = 0.5
 """Share of a Hough segment that no earlier line has claimed, at least."""
 STATION_PX = 1.5
@@ -100,40 +102,78 @@ def _labelled(masks: Masks) -> tuple[tuple[LineLabel, NDArray[np.bool_]], ...]:
 def _segments(
     mask: NDArray[np.bool_], masks: Masks, unit: float
 ) -> list[tuple[Floats, Floats, tuple[float, float]]]:
-    """Straight pieces of a mask's ridge: two ends (2,) in image px and the stroke's widths there, px."""
-    # A border of background: strokes that the image cuts keep their width.
+    """Straight pieces of a mask's core: two ends (2,) in image px and the stroke's widths there, px."""
+    # Strokes that the image's border cuts keep their width there.
     padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    ridge = ((depth > 0) & (depth >= cv2.dilate(depth, np.ones((3, 3))) - _TIE)).astype(np.uint8)
     grid = min(masks.scale_x, masks.scale_y)
-    shortest = MIN_LENGTH_PX * unit * grid
-    found = cv2.HoughLinesP(
-        ridge, 1.0, math.radians(0.5), max(6, int(0.5 * shortest)), None, shortest, HOUGH_GAP_PX * unit * grid
-    )
+    stroke = (depth > 0) & (depth < MAX_HALF_PROFILE_PX * unit * grid)
+    # Not only the maxima: along a slanted stroke they come and go with the grid.
+    core = (stroke & (depth >= CORE * cv2.dilate(depth, np.ones((7, 7))))).astype(np.uint8)
+    shortest, gap = MIN_LENGTH_PX * unit * grid, HOUGH_GAP_PX * unit * grid
+    # One px wider: Hough's walk along a slanted line of one px width stumbles over its steps.
+    wider = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
+    votes = max(_LEAST_VOTES, int(0.5 * shortest))
+    found = cv2.HoughLinesP(wider, 1.0, math.radians(0.5), votes, None, shortest, gap)
     if found is None:
         return []
     ends = found.reshape(-1, 2, 2).astype(np.float64)
     ends = ends[np.argsort(-np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))]
-    claimed = np.zeros_like(ridge)
+    pixels = np.argwhere(core > 0)[:, ::-1].astype(np.float64)
+    half_width = cv2.dilate(depth, np.ones((3, 3)))
+    claimed = np.zeros(core.shape, dtype=np.uint8)
     segments = []
     scale = np.array([masks.scale_x, masks.scale_y])
-    for start, end in ends:
-        count = max(2, round(float(np.abs(end - start).max())) + 1)
-        column, row = np.rint(np.linspace(start, end, count)).astype(np.int64).T
+    for rough in ends:
+        column, row = _between(rough[0], rough[1])
         if claimed[row, column].mean() > 1.0 - MIN_FRESH:
             continue
-        # The ridge's depth is half the width plus the half pixel to the border's centre.
-        width = np.maximum(2.0 * depth[row, column] - 1.0, 1.0) / grid
-        half = max(1, count // 3)
-        widths = float(np.median(width[:half])), float(np.median(width[-half:]))
-        thickness = max(3, math.ceil(1.5 * max(widths) * grid))
-        cv2.line(claimed, _pixel(start), _pixel(end), 1, thickness)
+        start, end = _settled(pixels, rough, gap)
+        column, row = _between(start, end)
+        # The depth in the middle is half the width plus the half px to the border's centre.
+        width = np.maximum(2.0 * half_width[row, column] - 1.0, 1.0) / grid
+        third = max(1, len(column) // 3)
+        widths = float(np.median(width[:third])), float(np.median(width[-third:]))
+        cv2.line(claimed, _pixel(start), _pixel(end), 1, max(3, math.ceil(1.5 * max(widths) * grid)))
         segments.append(((start + 0.5) / scale - 0.5, (end + 0.5) / scale - 0.5, widths))
     return segments
 
 
-_TIE = 1e-3
-"""px of depth within which two neighbours are both on the ridge."""
+_LEAST_VOTES = 6
+"""Core px on a Hough line, at least: fewer are on a line by chance."""
+_CORRIDOR_PX = 2.0
+"""Grid px to each side of a Hough line: its own tolerance and half the width of the core."""
+
+
+def _between(start: Floats, end: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns and rows of the grid px from start to end."""
+    count = max(2, round(float(np.abs(end - start).max())) + 1)
+    column, row = np.rint(np.linspace(start, end, count)).astype(np.int64).T
+    return column, row
+
+
+def _settled(pixels: Floats, rough: Floats, gap: float) -> tuple[Floats, Floats]:
+    """A Hough segment (2,2) turned onto the core's px (N,2) around it and prolonged as far as they go on."""
+    start, end = rough
+    for _ in range(3):
+        length = max(float(np.linalg.norm(end - start)), 1.0)
+        direction = (end - start) / length
+        offset = pixels - start
+        near = np.abs(offset @ np.array([-direction[1], direction[0]])) <= _CORRIDOR_PX
+        members, along = pixels[near], offset[near] @ direction
+        order = np.argsort(along)
+        members, along = members[order], along[order]
+        runs = np.concatenate([[0], np.flatnonzero(np.diff(along) > gap) + 1, [len(along)]])
+        middle = int(np.searchsorted(runs, np.searchsorted(along, length / 2), side="right"))
+        run = members[runs[max(middle, 1) - 1] : runs[max(middle, 1)]]
+        if len(run) < _LEAST_VOTES:
+            break
+        mean = run.mean(axis=0)
+        axis = np.linalg.svd(run - mean, full_matrices=False)[2][0]
+        axis = axis if axis @ direction > 0 else -axis
+        along = (run - mean) @ axis
+        start, end = mean + along.min() * axis, mean + along.max() * axis
+    return start, end
 
 
 def _pixel(point: Floats) -> tuple[int, int]:

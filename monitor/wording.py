@@ -85,9 +85,11 @@ def moved_axes(status: Status) -> tuple[AxisName, ...]:
 
 
 def unchecked_text(status: Status) -> str:
-    """Which axes were not checked and why, or that all were."""
-    held = [name for name, axis in status.drift.items() if not axis.observable]
-    blunt = [name for name, axis in status.drift.items() if axis.observable and not axis.monitored]
+    """Which axes were not checked and why, or that all were; those said to have moved were."""
+    moved = moved_axes(status) if status.state in ("drifted", "suspect") else ()
+    rest = [(name, axis) for name, axis in status.drift.items() if name not in moved]
+    held = [name for name, axis in rest if not axis.observable]
+    blunt = [name for name, axis in rest if axis.observable and not axis.monitored]
     parts = [f"{', '.join(held)} (not observable)"] if held else []
     if blunt:
         parts.append(f"{', '.join(blunt)} (too uncertain to exclude a drift of the limit)")

@@ -170,6 +170,12 @@ def test_commands_that_are_named_exist():
     assert all(text.startswith("calibwatch ") for text in named)
 
 
+def test_an_axis_that_moved_is_not_among_the_unchecked():
+    axes = {"yaw": BLUNT | {"value": 0.8}, "roll": BLUNT}
+    assert unchecked_text(status("drifted", axes)).startswith("not checked: roll (too")
+    assert unchecked_text(status("unobservable", axes)).startswith("not checked: roll, yaw (too")
+
+
 def test_all_checked_is_said_only_when_all_are_monitored():
     assert unchecked_text(status()) == "all six axes were checked"
     assert unchecked_text(status(axes={"roll": BLUNT})).startswith("not checked: roll")

@@ -11,10 +11,11 @@ from google.protobuf.message import Message as Protobuf
 
 from monitor.messages import CameraInfo, Codec, Decoded, Message, Transform
 from monitor.messages.camera_info import camera_model, rectified_model
+from monitor.messages.header import NS
 from monitor.messages.picture import picture
 from monitor.messages.pixels import Raster, bgr_pixels
 from monitor.messages.point_fields import KNOWN, Field, Packing, cloud_of, packed_columns
-from monitor.messages.ros import NS, frame_name
+from monitor.messages.ros import frame_name
 from monitor.messages.tf import is_static, motion
 from pipeline.errors import InputError
 from pipeline.records import CameraImage, Floats, PointCloud

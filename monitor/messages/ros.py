@@ -1,6 +1,5 @@
 """The wire of ROS: CDR (both byte orders) and the serialisation of ROS 1, read as messages of ROS 2."""
 
-import struct
 from functools import cache
 from typing import TypeVar
 
@@ -11,20 +10,14 @@ from rosbags.typesys.stores.ros2_jazzy import builtin_interfaces__msg__Time as T
 from rosbags.typesys.stores.ros2_jazzy import std_msgs__msg__Header as Header
 
 from monitor.messages import Codec, Message
+from monitor.messages.header import NS
+from monitor.messages.header import header_stamp_ns as header_stamp_ns  # noqa: PLC0414 - sources import it from here
 from pipeline.errors import InputError
 
 CODECS: dict[str, Codec] = {}
 """This module is shared by those of the ROS messages and decodes no type by itself."""
 
-NS = 1_000_000_000
 _T = TypeVar("_T")
-_STAMPED = (
-    "sensor_msgs/msg/PointCloud2",
-    "sensor_msgs/msg/CompressedImage",
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/CameraInfo",
-)
-_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 @cache
@@ -81,28 +74,3 @@ def header(stamp: int, frame: str) -> Header:
 def frame_name(frame: str) -> str:
     """A frame id as tf2 writes it: ROS 1 allowed a leading slash."""
     return frame.lstrip("/")
-
-
-def header_stamp_ns(message: Message) -> int | None:
-    """Stamp of a message, ns, read without decoding what it carries (tf: of the first transform).
-
-    None where the message states none that can be read so: too short, without transforms, or of a type whose
-    stamp does not stand at its beginning. A folder's messages answer with the stamp that the source knows.
-    """
-    if message.encoding == "file":
-        return message.stamp_ns
-    if message.type not in _STAMPED + _TRANSFORMS or message.encoding not in ("cdr", "ros1"):
-        return None
-    order = "<" if message.encoding == "ros1" or message.data[1:2] == b"\x01" else ">"
-    try:
-        start = 4  # behind the CDR encapsulation, or behind the sequence number of ROS 1
-        if message.type in _TRANSFORMS:
-            first = 0 if message.encoding == "ros1" else 4
-            (count,) = struct.unpack_from(f"{order}I", message.data, first)
-            if count == 0:
-                return None
-            start += 4
-        sec, nanosec = struct.unpack_from(f"{order}iI", message.data, start)
-    except struct.error:
-        return None
-    return int(sec) * NS + int(nanosec)

@@ -9,7 +9,6 @@ from rosbags.typesys.stores.ros2_jazzy import geometry_msgs__msg__Transform as R
 from rosbags.typesys.stores.ros2_jazzy import geometry_msgs__msg__TransformStamped as TransformStamped
 from rosbags.typesys.stores.ros2_jazzy import geometry_msgs__msg__Vector3 as Vector3
 from rosbags.typesys.stores.ros2_jazzy import tf2_msgs__msg__TFMessage as TFMessage
-from scipy.spatial.transform import Rotation
 
 from monitor.messages import Codec, Decoded, Message, Transform, ros
 from pipeline.errors import InputError
@@ -50,7 +49,7 @@ def motion(translation: tuple[float, float, float], quaternion: tuple[float, flo
             hint="the publisher left the transform unset",
         )
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(np.array(quaternion) / norm).as_matrix()
+    T[:3, :3] = _rotation(*(value / norm for value in quaternion))
     T[:3, 3] = translation
     return T
 
@@ -77,12 +76,38 @@ def _decoded(stamped: TransformStamped, *, static: bool) -> Decoded:
 
 def _stamped(transform: Transform, stamp_ns: int) -> TransformStamped:
     x, y, z = (float(value) for value in transform.T_parent_child[:3, 3])
-    turn = Rotation.from_matrix(transform.T_parent_child[:3, :3]).as_quat()
+    turn = _quaternion(transform.T_parent_child[:3, :3])
     return TransformStamped(
         ros.header(stamp_ns, transform.parent),
         transform.child,
-        RosTransform(Vector3(x, y, z), Quaternion(*(float(value) for value in turn))),
+        RosTransform(Vector3(x, y, z), Quaternion(*turn)),
     )
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> Floats:
+    """Rotation (3,3) of a unit quaternion; scipy's would cost every command some 0.3 s of start-up."""
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion(R: Floats) -> tuple[float, float, float, float]:
+    """Quaternion (x, y, z, w) of a rotation (3,3): the dominant axis of q q^T, which R determines."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    outer = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(outer)[1][:, -1].tolist()
+    return x, y, z, w
 
 
 CODECS: dict[str, Codec] = {TYPE: decode, "tf/msg/tfMessage": decode}

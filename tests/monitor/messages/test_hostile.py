@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monitor.messages import Decoded, Message, codecs, decode
-from monitor.messages.ros import header_stamp_ns
+from monitor.messages.header import header_stamp_ns
 from pipeline.errors import InputError
 from tests.monitor.messages import cloud_files, wire
 

@@ -1,7 +1,14 @@
 import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from monitor.messages import Message, codecs, decode
-from monitor.messages.ros import header_stamp_ns
+from monitor.messages.header import header_stamp_ns
 from tests.monitor.messages import wire
 
 MOTION = ("a", "b", (0, 0, 0), (0, 0, 0, 1))
@@ -28,6 +35,18 @@ def test_transforms_without_any_have_no_stamp(transport):
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf"])
 def test_messages_cut_short_have_no_stamp(name, encoding):
     assert header_stamp_ns(Message("/t", name, encoding, b"\0\1\0\0\1\0\0\0", 5)) is None
+
+
+def test_foxglove_messages_begin_with_their_stamp():
+    for kind in (PointCloud, CompressedImage, RawImage, CameraCalibration, FrameTransform):
+        message = kind(timestamp=Timestamp(seconds=1_600_000_000, nanos=5))
+        name = message.DESCRIPTOR.full_name
+        data = message.SerializeToString()
+        assert header_stamp_ns(Message("/t", name, "protobuf", data, 0)) == 1_600_000_000_000_000_005
+        assert header_stamp_ns(Message("/t", name, "protobuf", data[:5], 0)) is None
+    nested = FrameTransforms(transforms=[FrameTransform(timestamp=Timestamp(seconds=1))])
+    message = Message("/t", "foxglove.FrameTransforms", "protobuf", nested.SerializeToString(), 0)
+    assert header_stamp_ns(message) is None
 
 
 def test_other_types_have_no_stamp_and_files_that_of_their_folder():

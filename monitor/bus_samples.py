@@ -14,7 +14,7 @@ import zenoh
 
 from monitor import bus
 from monitor.messages import Encoding, Message
-from monitor.messages.ros import header_stamp_ns
+from monitor.messages.header import header_stamp_ns
 from monitor.sources.mcap_file import ros_type
 from pipeline.errors import InputError
 

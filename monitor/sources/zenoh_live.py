@@ -8,7 +8,6 @@ AdvancedPublisher gives), else, estimated, in the stamps.
 
 import logging
 import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -20,6 +19,7 @@ import zenoh.ext
 
 from monitor import bus
 from monitor.bus_samples import SampleReader, Subscription
+from monitor.clock import SystemClock
 from monitor.messages import Message, codecs
 from monitor.rig import Rig
 from monitor.sources import Losses, Tick, TopicInfo
@@ -257,7 +257,7 @@ class ZenohKind:
         session = bus.open_session(bus.BusSettings(connect=(location,)))
         everything = Subscription(topic=None, keys=("**",))
         return ZenohLive(
-            session, (everything,), now_ns=time.time_ns, stop=threading.Event(), owns_session=True
+            session, (everything,), now_ns=SystemClock().wall_ns, stop=threading.Event(), owns_session=True
         )
 
 

@@ -130,6 +130,8 @@ def _segments(
             continue
         start, end = _settled(pixels, rough, gap)
         column, row = _between(start, end)
+        # A slanted line that leaves the image between two px of its grid ends just outside.
+        column, row = np.clip(column, 0, core.shape[1] - 1), np.clip(row, 0, core.shape[0] - 1)
         # The depth in the middle is half the width plus the half px to the border's centre.
         width = np.maximum(2.0 * half_width[row, column] - 1.0, 1.0) / grid
         third = max(1, len(column) // 3)

@@ -29,7 +29,7 @@ _LENS_STEP_PX = 8
 _NEAR_M = 0.05
 """m; solids are cut there to find their place in the image."""
 _TONE_STEP = 0.25
-"""Relative step of brightness between neighbours that counts as a border (window, shadow); grain lies below."""
+"""Relative step of brightness between neighbours that counts as a border (window, shadow); grain is less."""
 _GAMMA = 1.0 / 2.2
 _RANK = np.array([0, 8, 7, 2, 3, 1, 4, 0, 6], dtype=np.int32)
 """Which class wins a pixel that is shared evenly: the thinner one."""

@@ -1,4 +1,4 @@
-"""A street drawn from a seed: ground, paint, furniture, buildings, trees, vehicles that park or move, light."""
+"""A street drawn from a seed: ground, paint, furniture, buildings, trees, vehicles that park or move."""
 # ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math

@@ -206,7 +206,8 @@ def _slabs(start: tuple[F32, F32, F32], u: F32, axes: tuple[int, ...]) -> tuple[
     """Where rays enter and leave the slabs -1..1 along the axes."""
     enter = leave = np.zeros((), dtype=np.float32)
     for step, k in enumerate(axes):
-        per_t = 1 / u[k]
+        # A ray along the slab: never 0 / 0.
+        per_t = 1 / (u[k] + np.float32(1e-30))
         middle, half = -start[k] * per_t, np.abs(per_t)
         enter = middle - half if step == 0 else np.maximum(enter, middle - half)
         leave = middle + half if step == 0 else np.minimum(leave, middle + half)

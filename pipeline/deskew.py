@@ -8,7 +8,7 @@ instant at which the camera exposes, so that what remains between cloud and imag
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from pipeline.records import Floats, PointCloud, read_only
 
 SpinSense: TypeAlias = Literal["cw", "ccw"]
 """Sense of rotation of the beams, seen from the tip of the spin axis (from above)."""
+
+_Real = TypeVar("_Real", np.float32, np.float64)
 
 _TURN = 2.0 * math.pi
 _SLOW_RAD_S = 1e-9
@@ -119,31 +121,35 @@ def turned(points: NDArray[np.floating], spin: Spin) -> Floats:
     return np.asarray(np.mod(np.arctan2(plan[:, 0], plan[:, 1]), _TURN), dtype=np.float64)
 
 
-def displaced(points: Floats, tau: Floats, twist: Twist) -> Floats:
+def displaced(points: NDArray[_Real], tau: Floats, twist: Twist) -> NDArray[_Real]:
     """``Exp(tau_i w) p_i`` in closed form (FORMULAS G3).
 
     Args:
-        points: float64 (N,3), metres, each in the LiDAR frame of its own instant.
+        points: (N,3), metres, each in the LiDAR frame of its own instant.
         tau: float64 (N,), s, that instant after the reference.
         twist: Constant over all of them.
 
     Returns:
-        float64 (N,3), metres, LiDAR frame of the reference instant.
+        (N,3), metres, LiDAR frame of the reference instant, in the type of ``points``.
     """
+    kind = points.dtype
     rate = float(np.linalg.norm(twist.omega))
     if rate < _SLOW_RAD_S:
-        return points + tau[:, None] * twist.velocity
+        moved = points.copy()
+        moved += np.multiply.outer(tau, twist.velocity).astype(kind)
+        return moved
     axis = twist.omega / rate
-    angle = rate * tau
-    sine, versine = np.sin(angle), 1.0 - np.cos(angle)
+    angle = (rate * tau).astype(kind)
+    sine, half = np.sin(angle), np.sin(angle / 2)
+    # 1 - cos loses its digits where the angle is small.
+    versine = 2 * half * half
+    W = se3.skew(axis)
+    moved = points + sine[:, None] * (points @ W.T.astype(kind))
+    moved += versine[:, None] * (points @ (W @ W).T.astype(kind))
     # The path of the origin: along the axis it goes straight, across it on a circle.
     along = axis * (axis @ twist.velocity)
-    across = np.cross(axis, twist.velocity) / rate
-    W = se3.skew(axis)
-    moved = points + sine[:, None] * (points @ W.T) + versine[:, None] * (points @ (W @ W).T)
-    moved += np.stack([tau, sine, versine], axis=1) @ np.stack(
-        [along, (twist.velocity - along) / rate, across]
-    )
+    path = np.stack([along, twist.velocity - along, np.cross(axis, twist.velocity)]) / rate
+    moved += np.stack([angle, sine, versine], axis=1) @ path.astype(kind)
     return moved
 
 
@@ -167,5 +173,5 @@ def deskew(cloud: PointCloud, time: NDArray[np.floating], twist: Twist, referenc
     tau = np.asarray(time, dtype=np.float64) - reference_s
     if tau.shape != (len(cloud),) or not np.isfinite(tau).all():
         raise InputError(f"{tau.shape} times for {len(cloud)} points", hint="give one finite time per point")
-    xyz = displaced(cloud.xyz.astype(np.float64), tau, twist).astype(np.float32)
+    xyz = displaced(cloud.xyz, tau, twist)
     return dataclasses.replace(cloud, xyz=xyz, time=np.full(len(cloud), reference_s, dtype=np.float32))

@@ -19,9 +19,9 @@ NEAREST_M = 2.0
 OCTAVES = 6
 """Cells double in size with each doubling of the range: 2 m to 128 m."""
 
-CELL_SHARES = (1.0 / 16.0, 1.0 / 8.0)
-"""Side of a cell as a share of the range, finest first: 3.6 deg hold three rings of 1.2 deg; the second is
-for sensors of 2 deg."""
+CELL_SHARES = (1.0 / 16.0, 1.0 / 4.0)
+"""Side of a cell as a share of the range, finest first: 3.6 deg hold three rings of 1.2 deg on a wall; the
+second holds two rings of 2 deg on the road, as far as seven times the sensor's height."""
 
 MIN_POINTS = 6
 """Points of a surfel: twice what a plane needs, so that its thickness means something."""
@@ -32,9 +32,6 @@ a plane."""
 
 MIN_EXTENT_M = 0.05
 """m, standard deviation along the shorter side: beyond range noise (2-3 cm), or the plane is made of it."""
-
-ENOUGH_SURFELS = 600
-"""Surfels of the finer cells that spare the coarser ones."""
 
 _MAX_TIME_SPREAD = 0.1
 """Share of the sweep over which the points of a surfel may spread in time: beyond it lies the seam of the
@@ -64,19 +61,30 @@ class Surfels:
 
 
 def surfels(cloud: PointCloud) -> Surfels:
-    """The small planes of a sweep; with times where the cloud has them."""
-    found = _planes(cloud, CELL_SHARES[0])
-    for share in CELL_SHARES[1:]:
-        if len(found) >= ENOUGH_SURFELS:
-            break
-        coarser = _planes(cloud, share)
-        found = coarser if len(coarser) > len(found) else found
-    return found
+    """The small planes of a sweep; with times where the cloud has them.
+
+    Points that lie on no plane in the finest cells are tried again in coarser ones: the road between the
+    rings of a sparse sensor, and of any sensor further away.
+    """
+    found: list[Surfels] = []
+    xyz, time = np.ascontiguousarray(cloud.xyz.T), cloud.time
+    for share in CELL_SHARES:
+        planes, left = _planes(xyz, time, share)
+        found.append(planes)
+        xyz, time = xyz[:, left], None if time is None else time[left]
+    return Surfels(
+        np.concatenate([f.centre for f in found]),
+        np.concatenate([f.normal for f in found]),
+        np.concatenate([f.thickness for f in found]),
+        np.concatenate([f.size for f in found]),
+        None if time is None else np.concatenate([f.time for f in found if f.time is not None]),
+    )
 
 
-def _planes(cloud: PointCloud, share: float) -> Surfels:
-    """Planes in cells of a side of ``share`` of the range (at the near end of each octave)."""
-    xyz = np.ascontiguousarray(cloud.xyz.T)
+def _planes(
+    xyz: NDArray[np.float32], time: NDArray[np.float32] | None, share: float
+) -> tuple[Surfels, NDArray[np.int64]]:
+    """Planes of points (3,N) in cells of ``share`` of the range, and the points that lie on none."""
     _, octave = np.frexp(np.abs(xyz).max(axis=0) / np.float32(NEAREST_M))
     octave -= 1
     inside = (octave >= 0) & (octave < OCTAVES)
@@ -111,14 +119,17 @@ def _planes(cloud: PointCloud, share: float) -> Surfels:
     )
     values, normal = _least_axes(C)
     flat = (values[0] < FLATNESS * values[1]) & (values[1] * side**2 > MIN_EXTENT_M**2)
-    time = None
-    if cloud.time is not None:
-        time, together = _cell_times(cloud.time[chosen].astype(np.float64), group, n)
+    cell_time = None
+    if time is not None:
+        cell_time, together = _cell_times(time[chosen].astype(np.float64), group, n)
         flat &= together
-        time = time[flat]
+        cell_time = cell_time[flat]
     centre = (mean + corner[:, first] + (0.5 - half)) * side
     thickness = np.sqrt(np.maximum(values[0], 0.0)) * side
-    return Surfels(centre[:, flat].T, normal[:, flat].T, thickness[flat], side[flat], time)
+    left = inside
+    left[chosen[flat[group]]] = False
+    planes = Surfels(centre[:, flat].T, normal[:, flat].T, thickness[flat], side[flat], cell_time)
+    return planes, np.flatnonzero(left)
 
 
 def _cell_times(time: Floats, group: NDArray[np.int64], count: Floats) -> tuple[Floats, NDArray[np.bool_]]:

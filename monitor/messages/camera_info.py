@@ -21,6 +21,9 @@ _COEFFICIENTS = {"pinhole": 0, "plumb_bob": 5, "rational_polynomial": 8, "equidi
 """How many coefficients each model reads; a message may leave trailing ones out, and what follows must be
 zero."""
 
+_FISHEYE = "equidistant"
+"""Bends without coefficients too: r = f theta."""
+
 _SYNONYMS = {"": "plumb_bob", "none": "pinhole", "fisheye": "equidistant", "kannala_brandt": "equidistant"}
 
 
@@ -32,20 +35,17 @@ def decode(message: Message) -> tuple[Decoded, ...]:
     """
     msg = ros.deserialize(message, RosCameraInfo, TYPE)
     crop = _crop(msg)
-    raw = camera_model(msg.distortion_model, msg.k.reshape(3, 3), msg.d, (msg.width, msg.height))
-    info = CameraInfo(
-        raw=_cropped(raw, crop),
-        rectified=None
-        if (model := rectified_model(msg.p.reshape(3, 4), (msg.width, msg.height))) is None
-        else _cropped(model, crop),
-    )
+    size = (msg.width, msg.height)
+    raw = camera_model(msg.distortion_model, msg.k.reshape(3, 3), msg.d, size)
+    rectified = rectified_model(msg.p.reshape(3, 4), size)
+    info = CameraInfo(_cropped(raw, crop), None if rectified is None else _cropped(rectified, crop))
     return (Decoded(ros.stamp_ns(msg.header.stamp), ros.frame_name(msg.header.frame_id), info),)
 
 
 def camera_model(name: str, K: Floats, D: Sequence[float] | Floats, size: tuple[int, int]) -> CameraModel:
     """The camera that a message's K, D and name of the distortion describe.
 
-    Coefficients that are all zero, or absent, make a pinhole whatever the name.
+    Coefficients that are all zero, or absent, make a pinhole of any lens but a fisheye.
 
     Args:
         name: Name of the distortion model, of ROS or Foxglove.
@@ -71,9 +71,7 @@ def camera_model(name: str, K: Floats, D: Sequence[float] | Floats, size: tuple[
             hint="a thin prism or tilted sensor is not modelled: calibrate with one of the known models",
         )
     coefficients = coefficients[:used]
-    if (
-        not coefficients.any() and model != "equidistant"
-    ):  # a fisheye without coefficients still bends: r = f theta
+    if not coefficients.any() and model != _FISHEYE:
         model, coefficients = "pinhole", np.empty(0)
     return CameraModel(model, np.array(K, np.float64), coefficients, *size)
 

@@ -1,7 +1,6 @@
 """Overlays of the report: the same place under the stored and under the estimated extrinsic.
 
-A frame is kept compressed, with the points and lines that either extrinsic puts into the image. Places are
-chosen where the extrinsics differ most in pixels, points are enough to see it, and the image has edges.
+A frame is kept compressed, with the points and lines that either extrinsic puts into the image.
 """
 
 from dataclasses import dataclass
@@ -11,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor.events import FrameEvent
+from monitor.outputs._places import Pixels, Place, best_places, within
 from pipeline import se3
 from pipeline.cameras import project, raw_pixels
 from pipeline.records import CameraModel, Floats, LineMatch
-
-Pixels = NDArray[np.uint8]
 
 STORED_BGR = (0, 120, 255)
 ESTIMATED_BGR = (255, 190, 60)
@@ -28,18 +26,10 @@ _CROP_JPEG_QUALITY = 82
 _OVERVIEW_JPEG_QUALITY = 68
 _MOST_POINTS = 20_000
 """points kept of a frame: enough for every place, 240 kB."""
-_CROPS_ACROSS = 6
-"""A crop is this part of the image's width: a drift of half a degree moves a point by a tenth of the crop."""
-_CROP_SHAPE = 1.4
-"""width / height of a crop."""
 _CROP_SHOWN_PX = 460
 """px; width of a crop as it is shown."""
 _OVERVIEW_PX = 860
 """px; largest width of the overview."""
-_ENOUGH_POINTS = 30
-"""points in a crop beyond which more do not make it better to judge."""
-_FEWEST_POINTS = 6
-"""points in a crop below which nothing can be judged."""
 _LINE_SAMPLES = 24
 """points along a line: a wide lens bends it."""
 
@@ -65,27 +55,6 @@ class KeptFrame:
     T_stored: Floats
     T_estimated: Floats
     matches: tuple[LineMatch, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """A part of the image, px of the raw image, and how far the extrinsics lie apart in it.
-
-    Attributes:
-        left: First column.
-        top: First row.
-        width: Columns.
-        height: Rows.
-        apart_px: Median displacement of the points between the two extrinsics.
-        points: Number of points.
-    """
-
-    left: int
-    top: int
-    width: int
-    height: int
-    apart_px: float
-    points: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +95,7 @@ def overlay(frame: KeptFrame, most_places: int) -> Overlay:
     """Draws the frame and at most ``most_places`` places of it."""
     image = np.asarray(cv2.imdecode(np.frombuffer(frame.jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
     stored, estimated = _projected(frame)
-    places = _places(image, stored, estimated, most_places)
+    places = best_places(image, stored, estimated, most_places)
     crops = tuple(
         Crop(
             place,
@@ -144,64 +113,6 @@ def _projected(frame: KeptFrame) -> tuple[Floats, Floats]:
     estimated, in_estimated = project(frame.camera, se3.apply(frame.T_estimated, frame.points))
     both = in_stored & in_estimated
     return stored[both], estimated[both]
-
-
-def _places(image: Pixels, stored: Floats, estimated: Floats, most: int) -> tuple[Place, ...]:
-    """The best places that do not overlap, best first."""
-    height, width = image.shape[:2]
-    w = max(1, width // _CROPS_ACROSS)
-    h = max(1, min(height, round(w / _CROP_SHAPE)))
-    edges = _edge_strength(image)
-    scored: list[tuple[float, Place]] = []
-    for top in range(0, height - h + 1, max(1, h // 3)):
-        for left in range(0, width - w + 1, max(1, w // 3)):
-            found = _place(stored, estimated, left, top, w, h)
-            if found is None:
-                continue
-            # Once more with its points in the middle.
-            inside = _inside(stored, estimated, left, top, w, h)
-            centre = np.median(0.5 * (stored + estimated)[inside], axis=0) - (0.5 * w, 0.5 * h)
-            x, y = (int(c) for c in np.clip(np.round(centre), 0, (width - w, height - h)))
-            place = _place(stored, estimated, x, y, w, h) or found
-            contrast = float(edges[place.top : place.top + h, place.left : place.left + w].mean())
-            scored.append((place.apart_px * min(place.points, _ENOUGH_POINTS) * contrast, place))
-    chosen: list[Place] = []
-    for _, place in sorted(scored, key=lambda item: item[0], reverse=True):
-        if len(chosen) < most and not any(_overlap(place, other) for other in chosen):
-            chosen.append(place)
-    return tuple(chosen)
-
-
-def _place(stored: Floats, estimated: Floats, *window: int) -> Place | None:
-    """The place (left, top, width, height), or None where too few points are in it to judge by."""
-    inside = _inside(stored, estimated, *window)
-    number = int(inside.sum())
-    if number < _FEWEST_POINTS:
-        return None
-    apart = np.linalg.norm(stored[inside] - estimated[inside], axis=1)
-    left, top, width, height = window
-    return Place(left, top, width, height, float(np.median(apart)), number)
-
-
-def _inside(stored: Floats, estimated: Floats, *window: int) -> NDArray[np.bool_]:
-    """Both ends of a displacement must be in the picture, or one of the two shows nothing."""
-    return _within(stored, *window) & _within(estimated, *window)
-
-
-def _edge_strength(image: Pixels) -> NDArray[np.float32]:
-    """Gradient of the brightness, (H,W), grey levels per px, held at what any clear edge has."""
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    du, dv = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
-    return np.minimum(np.hypot(du, dv) / 8.0, 20.0).astype(np.float32)
-
-
-def _within(uv: Floats, left: int, top: int, width: int, height: int) -> NDArray[np.bool_]:
-    u, v = uv[:, 0], uv[:, 1]
-    return (u >= left) & (u < left + width) & (v >= top) & (v < top + height)
-
-
-def _overlap(a: Place, b: Place) -> bool:
-    return abs(a.left - b.left) < a.width and abs(a.top - b.top) < a.height
 
 
 def _drawn(
@@ -224,7 +135,7 @@ def _drawn(
             whole = line[np.isfinite(line).all(axis=1)]
             if len(whole) > 1:
                 cv2.polylines(canvas, [shown(whole)], False, tint, thickness, cv2.LINE_AA, 4)  # noqa: FBT003
-    for point in shown(uv[_within(uv, place.left, place.top, place.width, place.height)]):
+    for point in shown(uv[within(uv, place.left, place.top, place.width, place.height)]):
         centre = (int(point[0]), int(point[1]))
         cv2.circle(canvas, centre, 56, _DARK_BGR, -1, cv2.LINE_AA, 4)
         cv2.circle(canvas, centre, 40, colour, -1, cv2.LINE_AA, 4)

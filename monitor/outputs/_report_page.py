@@ -192,7 +192,7 @@ def _plotted(index: int, pair: PairMaterial) -> dict[str, Any]:
                 "id": f"plot-{index}-{name}",
                 "name": name,
                 "unit": unit_of(name),
-                "limit": pair.last.drift[name].alert_limit,
+                "limit": float(f"{pair.last.drift[name].alert_limit:.4g}"),
                 "value": rounded([sample.values[place] for sample in pair.samples]),
                 "sigma": rounded([sample.sigmas[place] for sample in pair.samples]),
             }

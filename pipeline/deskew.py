@@ -133,9 +133,9 @@ def displaced(points: NDArray[_Real], tau: Floats, twist: Twist) -> NDArray[_Rea
         (N,3), metres, LiDAR frame of the reference instant, in the type of ``points``.
     """
     kind = points.dtype
+    moved = points.copy()
     rate = float(np.linalg.norm(twist.omega))
     if rate < _SLOW_RAD_S:
-        moved = points.copy()
         moved += np.multiply.outer(tau, twist.velocity).astype(kind)
         return moved
     axis = twist.omega / rate
@@ -144,7 +144,7 @@ def displaced(points: NDArray[_Real], tau: Floats, twist: Twist) -> NDArray[_Rea
     # 1 - cos loses its digits where the angle is small.
     versine = 2 * half * half
     W = se3.skew(axis)
-    moved = points + sine[:, None] * (points @ W.T.astype(kind))
+    moved += sine[:, None] * (points @ W.T.astype(kind))
     moved += versine[:, None] * (points @ (W @ W).T.astype(kind))
     # The path of the origin: along the axis it goes straight, across it on a circle.
     along = axis * (axis @ twist.velocity)

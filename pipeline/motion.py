@@ -21,10 +21,11 @@ from pipeline.records import Floats, PointCloud, read_only
 from pipeline.surfels import Surfels, surfels
 
 UnknownReason: TypeAlias = Literal[
-    "few planes", "free direction", "no agreement", "uncertain", "implausible speed"
+    "too far apart", "few planes", "free direction", "no agreement", "uncertain", "implausible speed"
 ]
-"""Why no motion is claimed: too few surfels; the scene's planes leave a direction free; planes that would
-fix a direction do not fit the motion; the covariance is too large; faster than a vehicle."""
+"""Why no motion is claimed: too long (or no) time between the sweeps; too few surfels; the planes of the
+scene leave a direction free; those that would fix a direction do not fit any one motion (traffic all
+around, wrong match); the covariance is too large; faster than a vehicle."""
 
 MIN_SURFELS = 150
 """Surfels below which nothing is registered: 25 for each of six unknowns."""
@@ -45,11 +46,19 @@ LOSS_SCALE = 3.0
 """Robust (Geman-McClure) scale in standard deviations; at twice it a match counts 1/25; what lies within it
 fits."""
 
+LONGEST_S = 0.5
+"""s between two sweeps: a vehicle that brakes or steers hard changes its speed by 4 m/s in it, and the
+twist is no longer constant."""
+
 FASTEST_M_S = 70.0
 """m/s; 250 km/h. Faster is a wrong match, or no road vehicle."""
 
 SEARCHED_M_S = 40.0
 """m/s; without a start, speeds up to 144 km/h are sought; a faster vehicle is found once it was slower."""
+
+SEARCHED_M = 6.0
+"""m; and no displacement beyond this, whatever the time between the sweeps: the cost grows with its
+square."""
 
 SEARCH_STEP_M = 0.6
 """m between tried displacements: half of it is within the gate of a surfel at 8 m and beyond."""
@@ -163,12 +172,14 @@ def estimate_twist(
     Args:
         previous: The earlier sweep; its surfels where the caller kept them from the last call.
         current: The later sweep, likewise.
-        seconds: Stamp of the later sweep minus that of the earlier, > 0.
+        seconds: Stamp of the later sweep minus that of the earlier.
         start: The last twist, or None: all speeds up to 40 m/s are tried, which takes ten times as long.
 
     Returns:
         The motion, or why it is not known.
     """
+    if not 0.0 < seconds <= LONGEST_S:
+        return MotionUnknown("too far apart")
     earlier = previous if isinstance(previous, Surfels) else surfels(previous)
     later = current if isinstance(current, Surfels) else surfels(current)
     if min(len(earlier), len(later)) < MIN_SURFELS:
@@ -285,7 +296,7 @@ def _searched(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float) -
     leverage = (((later.normal @ directions) ** 2) / np.maximum(shares, 1e-6)).sum(axis=1)
     judges = np.argsort(-leverage, kind="stable")[:SEARCH_SURFELS]
     centre, normal = later.centre[judges], later.normal[judges]
-    steps = math.ceil(SEARCHED_M_S * seconds / SEARCH_STEP_M)
+    steps = math.ceil(min(SEARCHED_M_S * seconds, SEARCHED_M) / SEARCH_STEP_M)
     grid = np.stack(np.meshgrid(*[np.arange(-steps, steps + 1)] * 2), axis=-1).reshape(-1, 2)
     grid = grid[np.hypot(grid[:, 0], grid[:, 1]) <= steps]
     tried = np.asarray(SEARCH_STEP_M * grid @ directions[:, :2].T, dtype=np.float64)

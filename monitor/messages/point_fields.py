@@ -4,10 +4,10 @@ Field names are compared in lower case. What a field means is settled here and n
 
 - ``x y z``: metres. Points that are not finite and returns at exactly (0, 0, 0), by which sensors mark a
   beam without an echo, are dropped from every array together.
-- intensity (:data:`INTENSITY`, the first that exists): 0..1. uint8 is divided by 255. Otherwise the 99.9 %
-  quantile q of the valid points decides: floats with q <= 1 stand as they are, anything else with q <= 255
-  is divided by 255, larger values (signal counts) are divided by q; then all is clipped to 0..1. The
-  quantile, not the largest value: a few retroreflectors beyond the nominal scale must not change it.
+- intensity (:data:`INTENSITY`, the first that exists): 0..1. uint8 is divided by 255. Floats of which 99 %
+  are at most 1 stand as they are. Anything else is divided by 255 or, where it is larger (signal counts), by
+  the 99.9 % quantile; then all is clipped to 0..1. Quantiles of the valid points, not the largest value:
+  signs and other retroreflectors beyond the nominal scale must not change it.
 - ring (:data:`RING`): kept where every valid point has a whole number in 0..65535.
 - time (:data:`TIME`): see :func:`seconds_after`.
 """
@@ -35,8 +35,11 @@ TIME = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
 KNOWN = frozenset(("x", "y", "z", *INTENSITY, *RING, *TIME))
 """Fields that :func:`cloud_of` reads; the others need not even be of a type that is known."""
 
-QUANTILE = 0.999
-"""Share of points that may lie beyond the nominal intensity scale: retroreflectors and glitches."""
+NOMINAL_SHARE = 0.99
+"""Share of points within 0..1 that tells a scale of 0..1; retroreflectors are some tenths of a percent."""
+
+COUNTS_SHARE = 0.999
+"""Share of signal counts that are not clipped: full scale is what hardly any point exceeds."""
 
 LONGEST_SWEEP_S = 2.0
 """s; spinning sensors take 0.05 to 0.2 s, slow scanners up to 1 s."""
@@ -178,10 +181,10 @@ def unit_intensity(values: Column) -> NDArray[np.float32]:
         found = np.where(np.isfinite(found), found, np.float32(0))
     if not len(found):
         return found
-    rank = int(QUANTILE * (len(found) - 1))
-    top = float(np.partition(found, rank)[rank])
-    if not (values.dtype.kind == "f" and top <= 1):
-        found /= np.float32(max(top, 255.0)) if top > 255 else np.float32(255)
+    nominal, counts = (int(share * (len(found) - 1)) for share in (NOMINAL_SHARE, COUNTS_SHARE))
+    ordered = np.partition(found, (nominal, counts))
+    if values.dtype.kind != "f" or ordered[nominal] > 1:
+        found /= np.maximum(ordered[counts], np.float32(255))
     return np.clip(found, 0, 1, out=found)
 
 

@@ -40,11 +40,13 @@ def test_signal_counts_are_scaled_by_their_high_quantile(dtype):
     assert (np.diff(found) >= 0).all()
 
 
-def test_a_retroreflector_does_not_change_the_scale():
-    values = np.full(10_000, 0.5, np.float32)
-    values[:5] = 3000
-    assert unit_intensity(values)[5:] == pytest.approx(0.5)
-    assert unit_intensity(values)[:5] == pytest.approx(1)
+@pytest.mark.parametrize(("usual", "bright", "many"), [(0.5, 3000, 50), (100, 60_000, 5)])
+def test_retroreflectors_do_not_change_the_scale(usual, bright, many):
+    values = np.full(10_000, usual, np.float32)
+    values[:many] = bright
+    found = unit_intensity(values)
+    assert found[many:] == pytest.approx(usual if usual <= 1 else usual / 255)
+    assert found[:many] == pytest.approx(1)
 
 
 def test_intensities_that_are_not_finite_or_negative_count_as_dark():

@@ -21,6 +21,8 @@ _SHAPE = 1.4
 """width / height of a place."""
 _STEPS = 3
 """places tried per width and height of one."""
+_MOVES = 3
+"""A place is moved this often towards the middle of its points."""
 _ENOUGH_POINTS = 30
 """points beyond which more do not make a place better to judge."""
 _FEWEST_POINTS = 6
@@ -70,13 +72,7 @@ def best_places(image: Pixels, stored: Floats, estimated: Floats, most: int) -> 
     scored: list[tuple[float, Place]] = []
     for top in range(0, height - h + 1, max(1, h // _STEPS)):
         for left in range(0, width - w + 1, max(1, w // _STEPS)):
-            inside = _inside(stored, estimated, left, top, w, h)
-            if inside.sum() < _FEWEST_POINTS:
-                continue
-            # Once more with its points in the middle.
-            centre = np.median(0.5 * (stored + estimated)[inside], axis=0) - (0.5 * w, 0.5 * h)
-            x, y = (int(c) for c in np.clip(np.round(centre), 0, (width - w, height - h)))
-            inside = _inside(stored, estimated, x, y, w, h)
+            x, y, inside = _centred(stored, estimated, (left, top, w, h), (width, height))
             number = int(inside.sum())
             if number < _FEWEST_POINTS:
                 continue
@@ -89,6 +85,22 @@ def best_places(image: Pixels, stored: Floats, estimated: Floats, most: int) -> 
         if len(chosen) < most and not any(_overlap(place, other) for other in chosen):
             chosen.append(place)
     return tuple(chosen)
+
+
+def _centred(
+    stored: Floats, estimated: Floats, window: tuple[int, int, int, int], size: tuple[int, int]
+) -> tuple[int, int, NDArray[np.bool_]]:
+    """Moves a window until its points stand in its middle: left, top, and which points it holds then."""
+    x, y, w, h = window
+    middle = 0.5 * (stored + estimated)
+    inside = _inside(stored, estimated, x, y, w, h)
+    for _ in range(_MOVES):
+        if not inside.any():
+            break
+        corner = np.round(np.median(middle[inside], axis=0) - (0.5 * w, 0.5 * h))
+        x, y = (int(c) for c in np.clip(corner, 0, (size[0] - w, size[1] - h)))
+        inside = _inside(stored, estimated, x, y, w, h)
+    return x, y, inside
 
 
 def within(uv: Floats, left: int, top: int, width: int, height: int) -> NDArray[np.bool_]:

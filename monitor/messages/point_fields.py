@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from monitor.messages import Codec
 from pipeline.errors import InputError
-from pipeline.records import Floats, PointCloud
+from pipeline.records import PointCloud
 
 CODECS: dict[str, Codec] = {}
 """This module is shared by those of the point clouds and decodes no type by itself."""
@@ -224,16 +224,18 @@ def seconds_after(values: Column, stamp_ns: int) -> NDArray[np.float32] | None:
     if unit is None or (real and float(np.spacing(values.max())) * unit > COARSEST_S * 1e9):
         return None
     origin = math.floor(low)  # whole units: the difference is taken first, so that nothing rounds
-    after_ns = _since(values, origin) * unit
+    after_ns = _since(values, origin)
+    after_ns *= unit
     first_ns = origin * unit - (stamp_ns if unit == since_1970 else 0)
     offset_ns = -float(after_ns.min()) if abs(first_ns) > LONGEST_SWEEP_S * 1e9 else float(first_ns)
-    seconds: Floats = (after_ns + offset_ns) * 1e-9
-    return seconds.astype(np.float32)
+    after_ns += offset_ns
+    after_ns *= 1e-9
+    return after_ns.astype(np.float32)
 
 
 def _since(values: Column, origin: int) -> NDArray[np.float64]:
     """``values - origin`` without rounding or overflow: their span is known to be small."""
     if values.dtype.kind == "f":
-        return values.astype(np.float64) - float(origin)
+        return np.subtract(values, float(origin), dtype=np.float64)
     wide = np.uint64 if values.dtype.kind == "u" else np.int64
-    return (values.astype(wide) - wide(origin)).astype(np.float64)
+    return np.subtract(values, wide(origin), dtype=wide).astype(np.float64)

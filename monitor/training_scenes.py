@@ -59,7 +59,7 @@ def write_scenes(folder: Path, count: int, seed: int, workers: int) -> None:
             "licence": "Apache-2.0",
             "labelled_classes": list(range(len(labels.NAMES))),
             "unlabelled_notes": "all classes, exact; people and pavement are 0, tree trunks 6",
-            "cameras": "drawn: five image sizes, focal length 0.5 to 1.15 widths, some with barrel distortion",
+            "cameras": "drawn: five image sizes, focal length 0.5 to 1.15 widths, some barrel distortion",
             "splits": {
                 "train": [name for k, name in enumerate(identifiers) if k % VALIDATION_EVERY],
                 "val": identifiers[::VALIDATION_EVERY],

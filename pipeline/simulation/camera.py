@@ -22,7 +22,7 @@ from pipeline.simulation.shadows import ShadowMap
 from pipeline.simulation.solids import CORNERS, Solids
 from pipeline.simulation.surface import F32, Rays
 
-_GRID = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+GRID = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 """px; places of the rays in a pixel (u, v): four different columns and rows."""
 _LENS_STEP_PX = 8
 """px; the inverse lens is computed so often and interpolated by cubics: 1e-8 of the focal length at most."""
@@ -103,8 +103,8 @@ def optics_of(camera: CameraModel) -> Optics:
             "the lens model folds inside the image", hint="a weaker distortion or a smaller image"
         )
     splines = [RectBivariateSpline(u, v, xy[:, :, k]) for k in range(2)]
-    rays = np.empty((len(_GRID), 2, camera.height, camera.width), dtype=np.float32)
-    for p, (du, dv) in enumerate(_GRID):
+    rays = np.empty((len(GRID), 2, camera.height, camera.width), dtype=np.float32)
+    for p, (du, dv) in enumerate(GRID):
         for k in range(2):
             rays[p, k] = splines[k](np.arange(camera.width) + du, np.arange(camera.height) + dv).T
     x, y = rays[:, 0], rays[:, 1]
@@ -144,9 +144,9 @@ def render(
     more = _rays(xy, T_world_cam)
     more_hits = cast(scene, solids, more, _listed(hits.tested, column))
     colour, more_classes = shade(View(scene, solids, more, more_hits, shadows, focal))
-    per_pixel = len(_GRID) - 1
+    per_pixel = len(GRID) - 1
     total = radiance[:, row, column] + colour.reshape(3, -1, per_pixel).sum(axis=2)
-    radiance[:, row, column] = total / np.float32(len(_GRID))
+    radiance[:, row, column] = total / np.float32(len(GRID))
     votes = np.concatenate([classes[row, column][:, None], more_classes.reshape(-1, per_pixel)], axis=1)
     classes[row, column] = _voted(votes)
     return Picture(CameraImage(_developed(radiance, look, rng)), classes)
@@ -184,7 +184,7 @@ def _busy(radiance: F32, classes: NDArray[np.uint8], hits: Hits) -> NDArray[np.b
 def _listed(windows: tuple[Window, ...], columns: NDArray[np.int64]) -> list[Window]:
     """The windows of an image as parts of a list of rays, some a pixel, whose pixels are sorted by column."""
     stops = [(w[2].start, w[2].stop) for w in windows]
-    ends = np.searchsorted(columns, np.array(stops, dtype=np.int64).reshape(-1, 2)) * (len(_GRID) - 1)
+    ends = np.searchsorted(columns, np.array(stops, dtype=np.int64).reshape(-1, 2)) * (len(GRID) - 1)
     every = slice(None)
     return [
         (w[0], every, slice(int(first), int(last)), w[3])

@@ -38,4 +38,9 @@ def test_a_crossing_is_half_paint():
 
 def test_a_patch_ends_at_its_ends():
     paint = Paint((), (Patch((5.0, 5.4), -1.0, (1.5, 1.5)),))
-    assert covered(paint, [4.99, 5.2, 5.41, 5.2], [-1.0, -2.4, -1.0, 0.6]).tolist() == [False, True, False, False]
+    assert covered(paint, [4.99, 5.2, 5.41, 5.2], [-1.0, -2.4, -1.0, 0.6]).tolist() == [
+        False,
+        True,
+        False,
+        False,
+    ]

@@ -14,7 +14,9 @@ WHOLE = (slice(None), slice(None))
 
 
 def solid(shape, centre, axes, half, material=Material.PLAIN):
-    return Solid(shape, np.array(centre, dtype=float), axes, np.array(half), 0, (0.5, 0.5, 0.5), 0.5, material)
+    return Solid(
+        shape, np.array(centre, dtype=float), axes, np.array(half), 0, (0.5, 0.5, 0.5), 0.5, material
+    )
 
 
 def rays(origin, directions, time=0.0):

@@ -58,7 +58,7 @@ def test_rays_that_rise_meet_nothing():
 def test_hills_and_kerbs_agree_with_a_march_along_the_ray():
     surface = hilly()
     origin, _, _ = surface.pose(20.0, -2.0)
-    origin = origin + [0.0, 0.0, 1.7]
+    origin = origin + np.array([0.0, 0.0, 1.7])
     d = directions(300, 4)
     t, what = surface.meet(rays_from(origin, d))
     march = np.arange(0.2, 90.0, 0.002)
@@ -106,7 +106,7 @@ def test_places_beside_the_road_have_their_road_coordinates():
     for left in (-5.0, 0.0, 3.0):
         place, heading, grade = surface.pose(np.array([15.0, 90.0, 160.0]), left)
         s, d = surface.road_coordinates(place[:, 0].astype(np.float32), place[:, 1].astype(np.float32))
-        # The cosine rule is exact on straights; on this bend it is off by the square of the offset times the curvature.
+        # The cosine rule is exact on straights; on a bend it is off by offset squared times curvature.
         np.testing.assert_allclose(d, left, atol=0.08)
         np.testing.assert_allclose(s, [15.0, 90.0, 160.0], atol=0.15)
         assert (np.abs(heading) < 0.8).all()

@@ -293,7 +293,12 @@ class OverBus:
         self._stack.close()
 
     def __iter__(self) -> Iterator[Message]:
-        yield from self._reader
+        try:
+            yield from self._reader
+        except TransportError:
+            # The writer's own failure says more than its silence.
+            if self._failure is None:
+                raise
         if self._failure is not None:
             raise self._failure
 

@@ -13,7 +13,9 @@ from typing import Protocol, Self
 
 import apsw
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag1 import ReaderError as Ros1Error
+from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import ReaderError as Ros2Error
 from ruamel.yaml.error import YAMLError
 
 from monitor.messages import Encoding, Message, codecs
@@ -25,7 +27,8 @@ _LARGEST_METADATA = 16 << 20
 """bytes; metadata.yaml of a drive in a thousand files has 1 MB."""
 _LISTED = re.compile(r"^\s*-\s*['\"]?([^'\"\n]+\.mcap)['\"]?\s*$", re.MULTILINE)
 DAMAGE = (
-    ReaderError,
+    Ros1Error,
+    Ros2Error,
     apsw.Error,
     YAMLError,
     AssertionError,

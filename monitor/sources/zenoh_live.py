@@ -192,7 +192,7 @@ class ZenohLive:
             message = self._inbox.take(self._period_s)
             if message is not None:
                 yield message
-            elif self._inbox.closed:
+            elif self._inbox.closed or self._stop.is_set():
                 return
             else:
                 yield Tick(self._now_ns())

@@ -199,7 +199,7 @@ def estimate_twist(
         information, gradient = _normal_equations(matches)
         # A billionth of the largest entry keeps a free direction where it is; it is told below.
         ridge = 1e-9 * float(np.trace(information)) * np.eye(6)
-        step = -np.linalg.solve(information + ridge, gradient)
+        step = np.asarray(-np.linalg.solve(information + ridge, gradient), dtype=np.float64)
         twist = Twist(twist.omega + step[:3], twist.velocity + step[3:])
         if _settled(step, seconds):
             break

@@ -33,6 +33,9 @@ a plane."""
 MIN_EXTENT_M = 0.05
 """m, standard deviation along the shorter side: beyond range noise (2-3 cm), or the plane is made of it."""
 
+_NO_SPREAD = 1e-60
+"""Where all eigenvalues are equal any direction is right; the cube of this is still a number."""
+
 _MAX_TIME_SPREAD = 0.1
 """Share of the sweep over which the points of a surfel may spread in time: beyond it lies the seam of the
 sweep."""
@@ -148,9 +151,8 @@ def _least_axes(C: Floats) -> tuple[Floats, Floats]:
     mean = C[:3].mean(axis=0)
     xx, yy, zz = C[:3] - mean
     xy, xz, yz = C[3:]
-    spread = (
-        np.sqrt((xx**2 + yy**2 + zz**2 + 2.0 * (xy**2 + xz**2 + yz**2)) / 6.0) + np.finfo(np.float64).tiny
-    )
+    squares = xx**2 + yy**2 + zz**2 + 2.0 * (xy**2 + xz**2 + yz**2)
+    spread = np.maximum(np.sqrt(squares / 6.0), _NO_SPREAD)
     determinant = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     angle = np.arccos(np.clip(determinant / (2.0 * spread**3), -1.0, 1.0)) / 3.0
     least = 2.0 * spread * np.cos(angle + 2.0 * math.pi / 3.0)

@@ -19,6 +19,10 @@ _HAZE_M = 700.0
 _SUN_COLOUR = np.array([[0.84], [0.96], [1.05]], dtype=np.float32)
 _SKY_COLOUR = np.array([[1.12], [1.0], [0.92]], dtype=np.float32)
 _PAINT_ALBEDO = 0.62
+_BODY_M = 1.2
+"""m; half length from which a part of a vehicle keeps the sky from the ground."""
+_CONTACT_M = 0.22
+"""m; how far beside a vehicle the ground is darker: about its clearance."""
 _GRASS = np.array([[0.035], [0.12], [0.075]], dtype=np.float32)
 _PAVING = np.array([[0.24], [0.26], [0.27]], dtype=np.float32)
 
@@ -118,8 +122,24 @@ def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint
     lit *= ~shaded_by_movers(place, view.solids, len(scene.standing), scene.light, noise.grain)
     facing = np.full(pixels.size, scene.light.sun[2], dtype=np.float32)
     facing[kerb] *= np.float32(0.6)
-    light = _light(view, facing, lit, np.ones(pixels.size, dtype=np.float32))
+    light = _light(view, facing, lit, _open_sky(view, place))
     return _hazed(view, pixels, albedo * light), classes
+
+
+def _open_sky(view: View, place: F32) -> F32:
+    """Share of the sky that points on the ground see (N,): little under and beside vehicles."""
+    sky = np.ones(place.shape[1], dtype=np.float32)
+    solids = view.solids
+    for index in {window[0] for window in view.hits.tested}:
+        half = solids.half[index]
+        if solids.label[index] != labels.VEHICLE or half[0] < _BODY_M:
+            continue
+        offset = place - solids.centre[index].astype(np.float32)[:, None]
+        near = np.flatnonzero(np.abs(offset[0]) + np.abs(offset[1]) < 1.5 * half[0] + 2.0)
+        local = solids.to_unit[index].astype(np.float32)[:2] @ offset[:, near]
+        outside = np.maximum(np.abs(local) - 1.0, 0.0) * half[:2, None].astype(np.float32)
+        sky[near] *= 1.0 - 0.85 * np.exp(-np.hypot(outside[0], outside[1]) / np.float32(_CONTACT_M))
+    return sky
 
 
 def _light(view: View, facing: F32, lit: F32, open_sky: F32) -> F32:
@@ -141,11 +161,12 @@ def _solids(view: View, points: SolidPoints) -> F32:
     material = view.solids.material[points.solid]
     local = points.unit * view.solids.half.astype(np.float32)[points.solid].T
     albedo = np.ascontiguousarray(view.solids.colour[points.solid].T)
-    swing = sample(noise.fine, local[0] + 0.7 * local[1], local[2] + 0.5 * local[1], 9.0)
     leaves = material == Material.LEAVES
-    soft = sample(noise.rough, local[0] + local[1], local[2], 20.0)
+    # Two planes across each other: no direction of a round surface is drawn out.
+    swing = sample(noise.fine, local[0], local[2], 9.0) + sample(noise.fine, local[1], local[2] + 7.3, 9.0)
+    soft = sample(noise.rough, local[0] - local[2], local[1] + local[2], 20.0)
     near = np.minimum(np.float32(0.2 * view.focal) / view.hits.t.ravel()[points.pixels], np.float32(1.0))
-    albedo *= np.where(leaves, np.exp(near * (0.45 * swing + 0.35 * soft)), 1.0 + 0.04 * swing + 0.03 * soft)
+    albedo *= np.where(leaves, np.exp(near * (0.4 * swing + 0.35 * soft)), 1.0 + 0.03 * swing + 0.03 * soft)
     _facade(view, points, local, albedo, np.flatnonzero(material == Material.FACADE))
     _cabin(points, albedo, np.flatnonzero(material == Material.CABIN))
     _plate(points, albedo, np.flatnonzero(material == Material.PLATE))

@@ -100,6 +100,19 @@ def test_invalid_points_leave_every_array_together():
     assert cloud.time == pytest.approx([0.0, 0.05])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("axis", "xyz")
+def test_one_coordinate_that_is_not_finite_drops_the_point(axis, value):
+    columns = with_xyz(intensity=np.array([0.1, 0.2])) | {axis: np.array([value, 2])}
+    assert cloud_of(columns, [*LAYOUTS["x y z"], ("intensity", "f4")]).xyz.tolist() == [[2, 2, 2]]
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_a_point_on_an_axis_is_no_empty_return(axis):
+    columns = {name: np.array([5.0 * (name == axis)]) for name in "xyz"}
+    assert len(cloud_of(columns, LAYOUTS["x y z"])) == 1
+
+
 def test_float64_beyond_float32_is_dropped_without_a_warning():
     cloud = cloud_of({"x": np.array([1e300, 1.0]), "y": np.ones(2), "z": np.ones(2)}, LAYOUTS["float64"])
     assert cloud.xyz.tolist() == [[1, 1, 1]]

@@ -196,6 +196,7 @@ def calib_document(
     camera: str | None = None,
     name: str | None = None,
     pairing: Pairing = "stamps",
+    spin: Literal["cw", "ccw"] | None = None,
 ) -> dict[str, object]:
     """``calib.json`` (``camera``, ``T_cam_lidar``; other keys are notes) in the form of the rig file.
 
@@ -206,6 +207,7 @@ def calib_document(
         camera: Topic of the images, or None: the only one.
         name: Name of the pair; default ``camera_name`` of the file, else "camera".
         pairing: Whether stamps or sequence numbers tell what belongs together.
+        spin: Sense of rotation of the LiDAR where the kind of folder tells it.
     """
     lens = calib.get("camera")
     if not isinstance(lens, Mapping) or "T_cam_lidar" not in calib:
@@ -217,7 +219,7 @@ def calib_document(
     own_name = calib.get("camera_name", "camera")
     pair: dict[str, object] = {
         "name": name or own_name,
-        "lidar": {"topic": lidar},
+        "lidar": {"topic": lidar, "spin": spin},
         "camera": {**section, "topic": camera},
         "extrinsic": {"T_cam_lidar": calib["T_cam_lidar"]},
         "pairing": pairing,

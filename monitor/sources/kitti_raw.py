@@ -271,9 +271,7 @@ def _document(location: Path, drive: Path, losses: Losses) -> dict[str, object] 
     for folder in (location, drive):
         if (folder / "calib.json").is_file():
             calib = read_json(folder / "calib.json")
-            return calib_document(
-                calib, where=str(folder / "calib.json"), lidar=LIDAR_TOPIC, camera=CAMERA_TOPIC
-            )
+            return _of_drive(calib, where=str(folder / "calib.json"))
     for folder in (drive, drive.parent):
         paths = (folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt")
         if all(path.is_file() for path in paths):
@@ -313,7 +311,12 @@ def kitti_document(
         "camera": {"K": K.tolist(), "D": [], "width": width, "height": height},
         "T_cam_lidar": T_cam_lidar.tolist(),
     }
-    return calib_document(calib, where=where, lidar=LIDAR_TOPIC, camera=CAMERA_TOPIC)
+    return _of_drive(calib, where=where)
+
+
+def _of_drive(calib: Mapping[str, object], *, where: str) -> dict[str, object]:
+    """The rig of a drive; KITTI's LiDAR turns clockwise and begins each turn behind the car."""
+    return calib_document(calib, where=where, lidar=LIDAR_TOPIC, camera=CAMERA_TOPIC, spin="cw")
 
 
 def _row(rows: Mapping[str, Floats], name: str, count: int, where: str) -> Floats:

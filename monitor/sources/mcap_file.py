@@ -46,7 +46,7 @@ _READERS: dict[int, Callable[[ReadDataStream, int], records.McapRecord]] = {
     Opcode.CHANNEL: lambda stream, _: records.Channel.read(stream),
     Opcode.MESSAGE: records.Message.read,
     Opcode.CHUNK: lambda stream, _: records.Chunk.read(stream),
-    Opcode.FOOTER: lambda stream, _: records.Footer.read(stream),
+    Opcode.DATA_END: lambda stream, _: records.DataEnd.read(stream),
 }
 """What is read; other records are passed over."""
 _DAMAGE = (
@@ -194,7 +194,7 @@ class McapFile:
             return
         offset = len(MAGIC)
         record: records.McapRecord | _Skipped | None = None
-        while not isinstance(record, records.Footer):
+        while not isinstance(record, records.DataEnd):
             record = self._record(offset)
             if record is None:
                 self._end = offset

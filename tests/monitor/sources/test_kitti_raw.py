@@ -83,6 +83,14 @@ def test_a_missing_frame_takes_its_stamp_with_it(tmp_path):
     assert [m.stamp_ns - FIRST for m in messages if m.topic == LIDAR_TOPIC] == [0, 200_000_000]
 
 
+def test_a_slice_with_its_original_numbers_has_a_stamp_per_file(tmp_path):
+    at = drive(tmp_path)
+    for path in sorted(at.glob("*/data/*"), reverse=True):
+        path.rename(path.with_stem(f"{int(path.stem) + 26:010d}"))
+    _, messages = opened(at)
+    assert [m.stamp_ns - FIRST for m in messages if m.topic == LIDAR_TOPIC] == [0, 100_000_000, 200_000_000]
+
+
 def test_the_folder_above_is_enough_when_it_contains_one_drive(tmp_path):
     drive(tmp_path / "2011_09_26")
     assert SOURCE.matches(str(tmp_path))
@@ -173,6 +181,7 @@ def test_the_files_of_a_real_drive_give_the_published_extrinsic(folder):
     with SOURCE.open(str(DATA / folder / "2011_09_26")) as source:
         rig = bind(parse_rig(source.rig_document(), where=folder), source.describe(), where=folder)
         first = next(iter(source))
+    assert rig.pairs[0].lidar.spin == "cw"
     calib = json.loads((DATA / folder / "calib.json").read_text())
     np.testing.assert_allclose(rig.pairs[0].T_cam_lidar, calib["T_cam_lidar"], atol=1e-6)
     np.testing.assert_allclose(rig.pairs[0].camera.model.K, calib["camera"]["K"])

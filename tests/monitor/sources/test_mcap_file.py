@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from monitor.messages import Message
@@ -76,6 +77,33 @@ def test_messages_come_in_the_order_of_log_time_whatever_the_file_says(tmp_path)
     messages, _ = read(tmp_path / "a.mcap")
     assert [m[1] for m in messages] == sorted(m[1] for m in truth)
     assert sorted(messages) == sorted(truth)
+
+
+def test_a_message_comes_before_the_rest_of_the_file_is_unpacked(recording, monkeypatch):
+    unpacked = []
+
+    def counting(chunk, *, validate_crc):
+        unpacked.append(chunk)
+        return breakup_chunk(chunk, validate_crc=validate_crc)
+
+    monkeypatch.setattr("monitor.sources.mcap_file.breakup_chunk", counting)
+    with SOURCE.open(str(recording[0])) as source:
+        ahead = [len(unpacked) for _ in source]
+    assert ahead[0] <= 2
+    assert ahead[COUNT // 2] <= len(unpacked) / 2 + 2
+
+
+def test_a_flipped_summary_is_not_believed(recording, tmp_path):
+    path, _ = recording
+    raw = path.read_bytes()
+    with path.open("rb") as file:
+        start = make_reader(file).get_summary().chunk_indexes[-1]
+        first = start.chunk_start_offset + start.chunk_length
+    bad = tmp_path / "bad.mcap"
+    for at in range(first + start.message_index_length, len(raw)):
+        bad.write_bytes(raw[:at] + bytes([raw[at] ^ 0x01]) + raw[at + 1 :])
+        with SOURCE.open(str(bad)) as source:
+            assert [(topic.name, topic.count) for topic in source.describe()] == [("/a", 30), ("/b", 30)], at
 
 
 def test_topics_are_told_with_counts_and_rates(recording):

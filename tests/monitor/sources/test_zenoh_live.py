@@ -83,7 +83,7 @@ def test_what_the_ring_overwrites_shows_as_a_gap(sessions):
     taken, go_on = threading.Event(), threading.Event()
 
     def now_ns():
-        # The thread of the subscription asks for the time while it has the first sample in hand: hold it there.
+        # The thread asks for the time while it has the first sample in hand: hold it there.
         taken.set()
         go_on.wait()
         return 0

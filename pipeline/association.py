@@ -28,6 +28,8 @@ MARGIN = 6.0
 """Twice the log likelihood by which a pair must beat every other of its lines: 20 to 1."""
 SAME_LINE_PX = 2.0
 """px; an image line this near to the continuation of another is a piece of it and no rival."""
+SAME_LINE_SLOPE = 0.05
+"""px per px beyond its end: roads bend by some 3 deg over the length of a piece."""
 MODEL_M = 0.015
 """m; paint's bright middle and its painted middle differ, poles taper: common to all points of a line."""
 
@@ -104,28 +106,35 @@ def _costs(pairs: plk.LinePairs, camera: CameraModel, T_cam_lidar: Floats, covar
 
 
 def _wins(cost: Floats, image_lines: Sequence[ImageLine], pair: tuple[int, int], unit: float) -> bool:
-    """Whether a pair beats every other pair of its cloud line and of its image line by the margin."""
+    """Whether a pair beats every other pair of its cloud line and of its image line by the margin.
+
+    Pieces of one image line, one behind the other, are no rivals: each shows its part of the cloud line.
+    """
     i, j = pair
     beaten = cost[i, j] + MARGIN
-    rival_clouds = np.delete(cost[:, j], i)
-    if (rival_clouds < beaten).any():
+    if (np.delete(cost[:, j], i) < beaten).any():
         return False
     for other in np.flatnonzero(cost[i] < beaten).tolist():
         if other == j:
             continue
-        same = _continues(image_lines[j], image_lines[other], SAME_LINE_PX * unit)
-        # Of two pieces of one line the likelier speaks for both.
-        if not same or cost[i, other] < cost[i, j]:
+        gap = _gap(image_lines[j], image_lines[other], unit)
+        if gap is None or (gap < 0 and cost[i, other] < cost[i, j]):
             return False
     return True
 
 
-def _continues(line: ImageLine, other: ImageLine, tolerance_px: float) -> bool:
-    along = (line.end - line.start) / np.linalg.norm(line.end - line.start)
-    normal = np.array([-along[1], along[0]])
-    return bool(
-        max(abs((other.start - line.start) @ normal), abs((other.end - line.start) @ normal)) <= tolerance_px
-    )
+def _gap(line: ImageLine, other: ImageLine, unit: float) -> float | None:
+    """Distance along a line to a piece that continues it, px, negative where they overlap; None if it is none."""
+    along = line.end - line.start
+    length = float(np.linalg.norm(along))
+    along = along / length
+    offset = np.stack([other.start, other.end]) - line.start
+    position = np.sort(offset @ along)
+    beyond = np.maximum(np.maximum(-(offset @ along), offset @ along - length), 0.0)
+    across = np.abs(offset @ np.array([-along[1], along[0]]))
+    if (across > SAME_LINE_PX * unit + SAME_LINE_SLOPE * beyond).any():
+        return None
+    return float(max(position[0] - length, -position[1]))
 
 
 def pair_on_overlap(

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from pipeline import plk, se3
 from pipeline.association import NO_PAIRS, Association, associate
 from pipeline.cameras import undistort
-from pipeline.cloud_lines import find_lanes, find_poles
+from pipeline.cloud_lanes import find_lanes
+from pipeline.cloud_poles import find_poles
 from pipeline.ground import fit_ground
 from pipeline.image_lines import find_image_lines
 from pipeline.records import (

@@ -1,0 +1,193 @@
+"""Poles of one sweep: free-standing, thin, upright (CRLF (5), (6); FORMULAS B).
+
+Works on unorganised clouds in any LiDAR frame: heights and the plan view come from the fitted ground.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.cloud_lines import FittedAxis, cloud_line, total_least_squares
+from pipeline.ground import Ground, plane_basis
+from pipeline.records import CloudLine, Floats, PointCloud
+
+Indices: TypeAlias = NDArray[np.int64]
+
+CELL_M = 0.5
+"""m; cell of the plan (CRLF III-B)."""
+POLE_RANGE_M = 60.0
+"""m; further a thin pole gets less than one return per ring."""
+BOTTOM_M = 0.73
+"""m above ground; H0' of FORMULAS B: kerbs, bases and cars' bonnets stay below."""
+TOP_M = 3.0
+"""m above ground; H1' of FORMULAS B where the sensor can see so high."""
+CEILING_M = 4.0
+"""m above ground; above begin arms, lamps and crowns."""
+MIN_EXTENT_M = 1.0
+"""m; seen height of a pole, at least (FORMULAS B)."""
+MAX_SPREAD_M = 0.15
+"""m rms across; a trunk half a metre thick has 0.144."""
+MAX_TILT = math.radians(5.0)
+"""rad; poles stand (FORMULAS B)."""
+AXIS_M = 0.35
+"""m; returns further from the axis are plates, arms or neighbours."""
+RING_M = (0.5, 1.0)
+"""m; a pole has this ring around it to itself: walls, hedges and vehicles do not (FORMULAS B)."""
+RING_SHARE = 0.1
+"""Returns in the ring over returns of the pole, at most."""
+MIN_POLE_POINTS = 8
+MIN_LEVELS = 4
+"""Height bins of 0.15 m with returns, at least: a line needs more than two rings."""
+_LEVEL_M = 0.15
+_POLE_REFITS = 3
+"""Rounds of fit and trim; the third changes no point in practice."""
+_MAX_POLE_CELLS = 2
+"""Cells across: a pole on a corner of the grid fills 2 x 2."""
+_TOP_SLACK_M = 0.3
+"""m; FORMULAS B: the highest beam may pass just above a return."""
+MAX_RADIUS_M = 0.3
+"""m; thicker than any street pole: a limit to the shift from the front surface to the axis."""
+MIN_SLOPE_REACH_M = 2.0
+"""m, horizontal; nearer returns come from the vehicle itself and say nothing of the highest beam."""
+
+
+def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> list[CloudLine]:
+    """Free-standing, thin, upright objects (CRLF (5), (6), heights above the fitted ground: FORMULAS B).
+
+    The sensor sees only the front of a pole. For returns spread evenly over a round front their mean lies
+    pi/4 of the radius before the axis; the radius follows from the returns' spread across the line of sight
+    (evenly spread: rms = radius / sqrt 3), and the line is moved back by that. What remains is some 10 % of
+    the diameter, and half of it for poles thinner than the azimuth step, whose spread is that of the noise.
+
+    Args:
+        cloud: The sweep.
+        ground: Its ground plane.
+        seen: bool (N,), points that may take part (those in view of the camera).
+
+    Returns:
+        Lines from foot to top, in no particular order.
+    """
+    basis = plane_basis(ground.normal).astype(np.float32)
+    height = cloud.xyz @ ground.normal.astype(np.float32) + np.float32(ground.offset)
+    index = np.flatnonzero(seen & (height > BOTTOM_M) & (height < CEILING_M))
+    plan = (cloud.xyz[index] @ basis.T).astype(np.float64)
+    near = np.hypot(plan[:, 0], plan[:, 1]) < POLE_RANGE_M
+    index, plan = index[near], plan[near]
+    if len(index) < MIN_POLE_POINTS:
+        return []
+    returns = _Returns(
+        index, cloud.xyz[index].astype(np.float64), plan, np.asarray(height[index], dtype=np.float64)
+    )
+    poles = []
+    for members in _pole_candidates(returns, ground.offset, _top_slope(cloud, ground, basis)):
+        line = _pole(returns, ground, members)
+        if line is not None:
+            poles.append(line)
+    return poles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Returns:
+    """Points above ground: index in the cloud, (M,3), (M,2) in the plan, height above ground (M,)."""
+
+    index: Indices
+    xyz: Floats
+    plan: Floats
+    up: Floats
+
+
+def _top_slope(cloud: PointCloud, ground: Ground, basis: np.ndarray) -> float:
+    """Tangent of the highest beam against the ground plane, from the cloud itself."""
+    thinned = cloud.xyz[:: max(1, len(cloud) // 20_000)]
+    reach = np.hypot(*(thinned @ basis.T).T)
+    far = reach > MIN_SLOPE_REACH_M
+    if not far.any():
+        return 0.0
+    slope = (thinned[far] @ ground.normal.astype(np.float32)) / reach[far]
+    return float(np.quantile(slope, 0.999))
+
+
+def _pole_candidates(returns: _Returns, sensor_height: float, top_slope: float) -> list[Indices]:
+    """Members of each group of tall cells that is small enough for a pole."""
+    plan, up = returns.plan, returns.up
+    low = plan.min(axis=0)
+    column, row = np.floor((plan - low) / CELL_M).astype(np.int64).T
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    cell = row * shape[1] + column
+    highest = np.full(shape[0] * shape[1], -np.inf)
+    lowest = np.full(shape[0] * shape[1], np.inf)
+    np.maximum.at(highest, cell, up)
+    np.minimum.at(lowest, cell, up)
+    reach = np.hypot(*(low[:, None] + CELL_M * (np.indices(shape)[::-1].reshape(2, -1) + 0.5)))
+    top = np.minimum(TOP_M, sensor_height + reach * top_slope - _TOP_SLACK_M)
+    tall = (highest - lowest >= MIN_EXTENT_M) & (highest > top)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        tall.reshape(shape).astype(np.uint8), connectivity=8
+    )
+    small = np.flatnonzero(
+        (stats[:, cv2.CC_STAT_WIDTH] <= _MAX_POLE_CELLS) & (stats[:, cv2.CC_STAT_HEIGHT] <= _MAX_POLE_CELLS)
+    )
+    wanted = np.zeros(count, dtype=bool)
+    wanted[small] = True
+    wanted[0] = False
+    label = labels.ravel()[cell]
+    inside = np.flatnonzero(wanted[label])
+    order = inside[np.argsort(label[inside], kind="stable")]
+    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+    return [group for group in groups if len(group) >= MIN_POLE_POINTS]
+
+
+def _pole(returns: _Returns, ground: Ground, members: Indices) -> CloudLine | None:
+    """The axis of one candidate, or None where it is no pole."""
+    centre = np.median(returns.plan[members], axis=0)
+    # The cells hold neighbours and may cut the pole; the square around the median holds its ring as well.
+    near = np.flatnonzero(np.abs(returns.plan - centre).max(axis=1) < RING_M[1])
+    xyz, up = returns.xyz[near], returns.up[near]
+    pole = np.hypot(*(returns.plan[near] - centre).T) < AXIS_M
+    axis, beyond = None, np.zeros(len(near))
+    for _ in range(_POLE_REFITS):
+        if pole.sum() < MIN_POLE_POINTS:
+            return None
+        axis = total_least_squares(xyz[pole])
+        beyond = np.linalg.norm(_across(xyz, axis), axis=1)
+        pole = beyond < min(AXIS_M, max(3.0 * axis.sigma, _LEVEL_M / 2))
+    if axis is None or pole.sum() < MIN_POLE_POINTS:
+        return None
+    axis = total_least_squares(xyz[pole])
+    low, high = float(up[pole].min()), float(up[pole].max())
+    beside = (beyond > RING_M[0]) & (beyond < RING_M[1]) & (up > low) & (up < high)
+    stands = (
+        abs(float(axis.direction @ ground.normal)) >= math.cos(MAX_TILT)
+        and high - low >= MIN_EXTENT_M
+        and len(np.unique(np.floor(up[pole] / _LEVEL_M))) >= MIN_LEVELS
+        and axis.sigma <= MAX_SPREAD_M
+        and beside.sum() <= RING_SHARE * pole.sum()
+    )
+    if not stands:
+        return None
+    moved = _behind_the_front(axis, _across(xyz[pole], axis), ground)
+    return cloud_line("pole", moved, returns.index[near[pole]])
+
+
+def _across(xyz: Floats, axis: FittedAxis) -> Floats:
+    """Offsets (M,3) of points (M,3) from an axis."""
+    centred = xyz - axis.mean
+    return np.asarray(centred - (centred @ axis.direction)[:, None] * axis.direction)
+
+
+def _behind_the_front(axis: FittedAxis, across: Floats, ground: Ground) -> FittedAxis:
+    """The axis moved along the line of sight from the mean of the visible front to the pole's middle."""
+    sign = 1.0 if axis.direction @ ground.normal > 0 else -1.0
+    upwards = sign * axis.direction
+    sight = axis.mean - (axis.mean @ upwards) * upwards
+    sight /= max(float(np.linalg.norm(sight)), 1e-9)
+    sideways = across @ np.cross(upwards, sight)
+    depth = across @ sight
+    # Range noise scatters the depth and not the width, so it does not enter the radius.
+    radius = min(MAX_RADIUS_M, math.sqrt(3.0) * float(sideways.std()))
+    sigma = math.sqrt(0.5 * float(sideways.var() + depth.var()))
+    return FittedAxis(axis.mean + math.pi / 4 * radius * sight, upwards, sign * axis.along, sigma)

@@ -1,0 +1,244 @@
+import importlib.util
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import se3
+from pipeline.line_witness import (
+    FRAME_CORRELATION,
+    LineFrame,
+    effective_frames,
+    find_lines,
+    in_view,
+    solve_lines,
+)
+from pipeline.observability import in_vehicle_axes, observable
+from pipeline.records import CameraImage, PointCloud
+
+_spec = importlib.util.spec_from_file_location(
+    "line_scenes", Path(__file__).parents[1] / "oracles" / "line_scenes.py"
+)
+scenes = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenes)
+
+LIMITS = np.array([*np.radians([0.75, 0.5, 0.5]), 0.20, 0.15, 0.15])
+R_VC = se3.AXES_CAM_IN_VEHICLE
+
+
+def frame(rng, **kwargs):
+    cloud, image = scenes.line_sets(rng, **kwargs)
+    return LineFrame(tuple(cloud), tuple(image), ())
+
+
+def in_axes(estimate):
+    drift, information = in_vehicle_axes(estimate.xi, estimate.information, R_VC)
+    return drift, observable(information, LIMITS)
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_drift_of_two_alert_limits_is_measured_on_its_axis(axis, sign):
+    rng = np.random.default_rng(axis)
+    injected = np.zeros(6)
+    injected[axis] = 2 * sign * LIMITS[axis]
+    frames = [frame(rng, sigma_px=0.5) for _ in range(6)]
+    solution = solve_lines(frames, scenes.CAMERA, se3.stored_before(scenes.TRUTH, injected, None))
+    drift, seen = in_axes(solution.estimate)
+    assert seen.axis_observed.all()
+    assert np.abs(drift - injected)[axis] < LIMITS[axis] / 2
+    assert (np.abs(drift - injected) < 4 * seen.axis_sigmas).all()
+    assert solution.estimate.frames == 6
+    assert solution.estimate.features == sum(map(len, solution.matches))
+
+
+def test_sigma_is_honest_in_every_observed_direction():
+    rng = np.random.default_rng(1)
+    scores = []
+    for _ in range(120):
+        injected = rng.normal(0, [*np.radians([0.4, 0.3, 0.3]), 0.1, 0.07, 0.07])
+        stored = se3.stored_before(scenes.TRUTH, injected, None)
+        solution = solve_lines([frame(rng)], scenes.CAMERA, stored)
+        drift, seen = in_axes(solution.estimate)
+        V = seen.directions[:, seen.observed]
+        scores.append(V.T @ ((drift - injected) / LIMITS) / seen.sigmas[seen.observed])
+    scores = np.concatenate(scores)
+    # The model's floor of 1.5 cm a line is not in the simulation, so sigma may be wide, never narrow.
+    assert 0.68 <= np.mean(np.abs(scores) < 1) <= 0.90
+    assert np.mean(np.abs(scores) < 2) >= 0.95
+
+
+def test_lanes_alone_hold_forward():
+    rng = np.random.default_rng(2)
+    solution = solve_lines([frame(rng, poles=[]) for _ in range(5)], scenes.CAMERA, scenes.TRUTH)
+    drift, seen = in_axes(solution.estimate)
+    assert seen.rank == 5
+    assert seen.axis_observed.tolist() == [True, True, True, False, True, True]
+    assert drift[3] == pytest.approx(0.0, abs=0.02)
+
+
+def test_poles_alone_hold_up():
+    rng = np.random.default_rng(3)
+    solution = solve_lines([frame(rng, lanes=[]) for _ in range(5)], scenes.CAMERA, scenes.TRUTH)
+    _, seen = in_axes(solution.estimate)
+    assert not seen.axis_observed[5]
+    assert seen.axis_observed[[2, 3, 4]].all()
+
+
+def test_what_is_held_does_not_spoil_what_is_seen():
+    """A forward drift that lanes can not see leaves pitch, yaw and up alone."""
+    rng = np.random.default_rng(4)
+    stored = se3.stored_before(scenes.TRUTH, np.array([0, 0, np.radians(0.8), 0.2, 0, 0]), None)
+    solution = solve_lines([frame(rng, poles=[]) for _ in range(5)], scenes.CAMERA, stored)
+    drift, seen = in_axes(solution.estimate)
+    assert drift[2] == pytest.approx(np.radians(0.8), abs=4 * seen.axis_sigmas[2])
+    assert abs(drift[5]) < 4 * seen.axis_sigmas[5]
+
+
+@pytest.mark.parametrize("kind", ["no frames", "empty frames", "nothing alike"])
+def test_nothing_matched_is_no_information(kind):
+    rng = np.random.default_rng(5)
+    lanes, poles = frame(rng, poles=[]), frame(rng, lanes=[])
+    frames = {
+        "no frames": [],
+        "empty frames": [LineFrame((), (), ("no ground plane in the cloud",))] * 3,
+        "nothing alike": [LineFrame(lanes.cloud_lines, poles.image_lines, ())],
+    }[kind]
+    estimate = solve_lines(frames, scenes.CAMERA, scenes.TRUTH).estimate
+    assert estimate.features == estimate.frames == 0
+    assert np.array_equal(estimate.information, np.zeros((6, 6)))
+    assert np.array_equal(estimate.xi, np.zeros(6))
+
+
+def test_a_frame_without_lines_changes_nothing():
+    rng = np.random.default_rng(6)
+    frames = [frame(rng) for _ in range(3)]
+    with_empty = solve_lines([*frames, LineFrame((), (), ())], scenes.CAMERA, scenes.TRUTH)
+    alone = solve_lines(frames, scenes.CAMERA, scenes.TRUTH)
+    assert np.array_equal(with_empty.estimate.xi, alone.estimate.xi)
+    assert with_empty.matches[3] == ()
+
+
+def test_the_same_frame_many_times_is_not_many_frames():
+    rng = np.random.default_rng(7)
+    one = frame(rng)
+    single = solve_lines([one], scenes.CAMERA, scenes.TRUTH).estimate
+    many = solve_lines([one] * 20, scenes.CAMERA, scenes.TRUTH).estimate
+    gain = np.trace(many.information) / np.trace(single.information)
+    assert gain < effective_frames(20) * 1.3
+
+
+def test_effective_frames_is_the_variance_ratio_of_an_ar1_mean():
+    phi, n = FRAME_CORRELATION, 9
+    lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    assert effective_frames(n) == pytest.approx(1.0 / ((phi**lags).sum() / n**2))
+    assert effective_frames(1) == 1.0
+    assert effective_frames(1000) == pytest.approx(1000 * (1 - phi) / (1 + phi), rel=0.01)
+
+
+def test_misfit_widens_the_answer():
+    rng = np.random.default_rng(8)
+    cloud, _ = scenes.line_sets(rng)
+    honest, rough = [], []
+    for _ in range(8):
+        cloud, image = scenes.line_sets(rng, sigma_px=0.5)
+        honest.append(LineFrame(tuple(cloud), tuple(image), ()))
+        cloud, image = scenes.line_sets(rng, sigma_px=3.0)
+        claimed = [type(line)(line.label, line.start, line.end, 0.5) for line in image]
+        rough.append(LineFrame(tuple(cloud), tuple(claimed), ()))
+    fine, poor = (solve_lines(frames, scenes.CAMERA, scenes.TRUTH).estimate for frames in (honest, rough))
+    assert fine.chi2 < 1.5 < poor.chi2
+    assert (np.diag(poor.information) < np.diag(fine.information)).all()
+
+
+def street(rng, *, turn=None):
+    """One frame from points and a drawn image."""
+    cloud = scenes.sampled_cloud(rng, turn=turn)
+    strokes = []
+    K = scenes.CAMERA.K
+    for label, ends, width in (("lane", scenes.lane_ends(), 0.15), ("pole", scenes.pole_ends(), 0.16)):
+        for start, end in ends:
+            points = se3.apply(scenes.TRUTH, np.stack([start, end]))
+            uv = points @ K.T
+            uv = uv[:, :2] / uv[:, 2:]
+            # A stroke as wide as in its middle: the centre line is what counts.
+            strokes.append((label, uv[0], uv[1], max(4.0, 721.5 * width / points[:, 2].mean())))
+    image, masks = scenes.draw(strokes, size=(1242, 375), rng=rng)
+    return cloud, image, masks
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_from_points_and_pixels_to_the_drift(turned):
+    rng = np.random.default_rng(9)
+    turn = se3.exp_so3(np.array([0.1, -0.2, math.pi / 2])) if turned else np.eye(3)
+    injected = np.array([0, 0, np.radians(0.7), 0, 0, 0])
+    stored = se3.stored_before(scenes.TRUTH, injected, None)
+    stored = stored @ se3.transform(turn.T, np.zeros(3))
+    cloud, image, masks = street(rng, turn=turn)
+    found = find_lines(
+        cloud,
+        image,
+        masks,
+        scenes.CAMERA,
+        stored,
+        up=turn @ scenes.UP,
+        forward=turn @ scenes.FORWARD,
+        rng=rng,
+    )
+    assert found.reasons == ()
+    for line in found.cloud_lines:
+        ahead = turn @ (scenes.FORWARD if line.label == "lane" else scenes.UP)
+        assert (line.end - line.start) @ ahead > 0
+    solution = solve_lines([found], scenes.CAMERA, stored)
+    drift, seen = in_axes(solution.estimate)
+    assert solution.estimate.features >= 6
+    assert seen.axis_observed[1:].all()
+    assert drift[2] == pytest.approx(injected[2], abs=np.radians(0.15))
+    assert (np.abs(drift - injected) < 4 * seen.axis_sigmas).all()
+
+
+def test_reasons_tell_what_could_not_be_looked_for():
+    rng = np.random.default_rng(10)
+    cloud, image, masks = street(rng)
+    args = {"up": scenes.UP, "forward": scenes.FORWARD, "rng": rng}
+    blind = find_lines(PointCloud(cloud.xyz), image, masks, scenes.CAMERA, scenes.TRUTH, **args)
+    assert blind.reasons == ("no lane lines in a cloud without intensity",)
+    assert {line.label for line in blind.cloud_lines} == {"pole"}
+    empty = PointCloud(np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32))
+    nothing = find_lines(empty, image, masks, scenes.CAMERA, scenes.TRUTH, **args)
+    assert nothing.reasons == ("no ground plane in the cloud",)
+    assert nothing.cloud_lines == ()
+    assert len(nothing.image_lines) > 0
+
+
+def test_view_keeps_what_projects_into_the_image():
+    rng = np.random.default_rng(11)
+    cloud, _, _ = street(rng)
+    seen = in_view(cloud, scenes.CAMERA, scenes.TRUTH)
+    points = se3.apply(scenes.TRUTH, cloud.xyz)
+    uv = points @ scenes.CAMERA.K.T
+    inside = (points[:, 2] > 1.0) & (np.abs(uv[:, 0] / uv[:, 2] - 620.5) < 621)
+    inside &= np.abs(uv[:, 1] / uv[:, 2] - 187) < 187.5
+    assert seen[inside].all()
+    assert not seen[points[:, 2] < 1.0].any()
+    assert seen.mean() < 0.9
+
+
+def test_black_image_and_no_masks_are_ordinary():
+    rng = np.random.default_rng(12)
+    cloud, _, _ = street(rng)
+    black = CameraImage(np.zeros((375, 1242, 3), dtype=np.uint8))
+    none = np.zeros((375, 1242), dtype=bool)
+    found = find_lines(
+        cloud,
+        black,
+        scenes.masks_of(none, none),
+        scenes.CAMERA,
+        scenes.TRUTH,
+        up=scenes.UP,
+        forward=scenes.FORWARD,
+        rng=rng,
+    )
+    assert found.image_lines == ()
+    assert solve_lines([found], scenes.CAMERA, scenes.TRUTH).estimate.features == 0

@@ -35,6 +35,10 @@ PERIOD_S = 0.5
 """s; without a message a Tick comes this often: four times within the 2 s after which inputs are stale."""
 JOIN_S = 2.0
 """s; a thread that takes longer to end is told of."""
+_MOST_TOPICS = 1024
+"""Topics that are told apart; a hostile bus may invent any number."""
+_MOST_NOTES = 64
+"""Sentences about losses; counts tell the rest."""
 _LATCHED = 64
 """Samples per key that are asked for from before: every broadcaster of static transforms once."""
 
@@ -86,6 +90,9 @@ class Inbox:
     def put(self, message: Message) -> None:
         """Takes a message; the oldest of its topic goes when that has too many waiting."""
         with self._condition:
+            if message.topic not in self._seen and len(self._seen) >= _MOST_TOPICS:
+                self._losses.add("too_many_topics")
+                return
             if self._counts[message.topic] >= self._per_topic:
                 oldest = next(i for i, old in enumerate(self._waiting) if old.topic == message.topic)
                 del self._waiting[oldest]
@@ -101,7 +108,7 @@ class Inbox:
         """Counts a loss; the same note is kept once."""
         with self._condition:
             self._losses.add(reason, number)
-            if note and note not in self._losses.notes:
+            if note and note not in self._losses.notes and len(self._losses.notes) < _MOST_NOTES:
                 self._losses.notes.append(note)
 
     def take(self, timeout_s: float) -> Message | None:

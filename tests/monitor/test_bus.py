@@ -1,6 +1,8 @@
 """Sessions, keys and attachments, on real sessions over the loopback."""
 
+import shutil
 import struct
+import subprocess
 
 import pytest
 import zenoh
@@ -67,6 +69,44 @@ def test_tls_files_that_are_absent(tmp_path):
     files = bus.TlsFiles(tmp_path / "ca.pem", tmp_path / "key.pem", tmp_path / "cert.pem")
     with pytest.raises(RigError, match=r"ca.pem can not be read"):
         open_session(BusSettings(connect=("tls/127.0.0.1:1",), tls=files))
+
+
+OPENSSL = shutil.which("openssl")
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    """An authority, two identities that it signed, and a stranger who calls himself like one of them."""
+    if OPENSSL is None:
+        pytest.skip("no openssl to make certificates with")
+    at = tmp_path_factory.mktemp("tls")
+    key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"]
+
+    def run(*arguments):
+        subprocess.run([OPENSSL, *arguments], cwd=at, check=True, capture_output=True)  # noqa: S603 - as above
+
+    run("req", "-x509", *key, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=authority")
+    run("req", "-x509", *key, "-keyout", "stranger.key", "-out", "stranger.pem", "-subj", "/CN=van")
+    (at / "names").write_text("subjectAltName=DNS:localhost\n")
+    for name in ("hub", "van"):
+        run("req", *key[:-2], "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
+        signing = ["-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", "-extfile", "names"]
+        run("x509", "-req", "-in", f"{name}.csr", *signing, "-out", f"{name}.pem")
+    return {
+        name: bus.TlsFiles(at / "ca.pem", at / f"{name}.key", at / f"{name}.pem")
+        for name in ("hub", "van", "stranger")
+    }
+
+
+def test_mutual_tls_lets_in_whom_the_authority_signed_and_nobody_else(certificates):
+    hub_settings = BusSettings(mode="router", listen=("tls/127.0.0.1:0",), tls=certificates["hub"])
+    with open_session(hub_settings) as hub:
+        endpoint = bus.listening_at(hub)[0].replace("127.0.0.1", "localhost")
+        with open_session(BusSettings(connect=(endpoint,), tls=certificates["van"])) as session:
+            assert [link.auth_identifier for link in session.info.links()] == ["hub"]
+        for tls in (certificates["stranger"], None):
+            with pytest.raises(TransportError, match="no session with tls/localhost"):
+                open_session(BusSettings(connect=(endpoint,), tls=tls, timeout_s=0.5))
 
 
 def test_keys_of_the_specification():

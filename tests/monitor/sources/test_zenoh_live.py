@@ -117,6 +117,17 @@ def test_one_slow_topic_leaves_the_others_alone():
     assert inbox.take(60) is None
 
 
+def test_a_bus_that_invents_topics_and_faults_fills_no_memory():
+    losses = Losses()
+    inbox = Inbox(losses)
+    for i in range(2000):
+        inbox.put(message(f"/{i}", 0))
+        inbox.lose("undecodable", note=f"fault {i}")
+    assert losses.counts == {"undecodable": 2000, "too_many_topics": 2000 - 1024}
+    assert len(inbox.describe({})) == 1024
+    assert len(losses.notes) == 64
+
+
 def message(topic, sequence):
     return Message(topic, "sensor_msgs/msg/Imu", "cdr", b"", 0, sequence=sequence)
 

@@ -7,6 +7,9 @@ from scipy.linalg import expm
 
 from pipeline.records import PointCloud
 
+REACH_M = 60.0
+"""m; the farthest return."""
+
 
 def twist_matrix(omega, velocity):
     """The 4x4 generator: its matrix exponential is the pose after a second."""
@@ -44,8 +47,8 @@ def sweep(
     velocity,
     start,
     clockwise=True,
-    rings=48,
-    columns=1000,
+    rings=40,
+    columns=720,
     period=0.1,
     noise=0.015,
     carried=None,
@@ -73,19 +76,27 @@ def sweep(
     origin = T[:, :3, 3] + np.array([0.0, 0.0, height])
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.where(direction[..., 2] < 0, -origin[:, 2] / direction[..., 2], np.inf)
+        # Columns that may meet a box, judged in plan with half a metre to spare for the tilt of the sensor.
+        level = np.einsum("cij,cj->ci", T[:, :3, :3], beams[rings // 2])[:, :2]
+        margin = np.array([[-0.5, -0.5], [0.5, 0.5]])
         for low, high in boxes:
-            distance = np.minimum(distance, _entry(low, high, origin, direction))
+            if np.linalg.norm(np.clip(0.0, low[:2], high[:2])) > REACH_M + 5.0:
+                continue
+            around = np.stack([low[:2], high[:2]]) + margin
+            meets = np.flatnonzero(_entry(*around, origin[:, :2], level, least=-np.inf) < np.inf)
+            entry = _entry(low, high, origin[meets], direction[:, meets])
+            distance[:, meets] = np.minimum(distance[:, meets], entry)
         for low, high in () if carried is None else carried:
             distance = np.minimum(distance, _entry(low, high, np.array([0.0, 0.0, height]), beams))
-    seen = distance < 70.0
+    seen = distance < REACH_M
     distance = distance + rng.normal(0.0, noise, distance.shape)
     xyz = beams[seen] * distance[seen][:, None]
     time = np.broadcast_to(share * period, (rings, columns))[seen]
     return PointCloud(xyz.astype(np.float32), time=time.astype(np.float32))
 
 
-def _entry(low, high, origin, direction):
+def _entry(low, high, origin, direction, least=0.5):
     near, far = (low - origin) / direction, (high - origin) / direction
     into = np.minimum(near, far).max(axis=-1)
     out = np.maximum(near, far).min(axis=-1)
-    return np.where((into < out) & (into > 0.5), into, np.inf)
+    return np.where((into < out) & (out > 0.5) & (into > least), into, np.inf)

@@ -93,6 +93,7 @@ def mount_of(pair: RigPair) -> Mount:
         sigma_m=pair.sigma_m,
         limits=pair.limits,
         required=pair.required,
+        spin=pair.lidar.spin,
     )
 
 

@@ -33,6 +33,9 @@ class DriftTestParameters:
         floor_roll: Systematic floor of roll between scenes, rad.
         floor_bearing: Floor of the bearing up and down, and across, at ``bearing_range``, rad: what is sure.
         floor_m: Floor of forward, left, up, m.
+        lines_floor_rad: Systematic floor of what lines say of one angle, rad: the middle of a mask is no more the
+            middle of the paint than a few px, and lanes leave roll to the far end of a dash.
+        lines_floor_m: The same of one shift, m.
         bearing_range: Range at which pitch and up, yaw and left make one bearing, m (PROBE 3).
         bound_rad: Bound of the systematic error of one angle between scenes, rad.
         bound_m: Bound of the systematic error of one shift between scenes, m.
@@ -50,6 +53,8 @@ class DriftTestParameters:
     floor_roll: float = math.radians(0.06)
     floor_bearing: float = math.radians(0.04)
     floor_m: tuple[float, float, float] = (0.03, 0.04, 0.03)
+    lines_floor_rad: float = math.radians(0.3)
+    lines_floor_m: float = 0.10
     bearing_range: float = 20.0
     bound_rad: float = math.radians(0.13)
     bound_m: float = 0.04
@@ -62,6 +67,10 @@ class DriftTestParameters:
         sigma = np.array([self.floor_roll, self.floor_bearing, self.floor_bearing, *self.floor_m])
         inverse = np.linalg.inv(A)
         return np.asarray(inverse @ np.diag(sigma**2) @ inverse.T, dtype=np.float64)
+
+    def lines_floor(self) -> Floats:
+        """Systematic floor of the line witness, float64 (6,6), vehicle axes."""
+        return np.diag([self.lines_floor_rad**2] * 3 + [self.lines_floor_m**2] * 3)
 
     def bound(self) -> Floats:
         """Bound b_j of the systematic error per axis, float64 (6,), rad and m (FORMULAS F5)."""

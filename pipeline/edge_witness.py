@@ -5,6 +5,7 @@ estimate is its maximum near the stored extrinsic; its covariance is the sandwic
 falls into one cell of the image over the whole window counts as ONE observation: the same car is one witness.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import cameras, se3
-from pipeline.edges import CELL_COLUMNS, CELL_ROWS, Edges
+from pipeline.edges import CELLS, Edges
 from pipeline.gradients import GradientPyramid, sample
 from pipeline.records import CameraModel, Floats
 
@@ -65,16 +66,25 @@ class EdgeFrame:
         stamp_ns: Stamp of the image.
         edges: Edges of the cloud.
         gradients: Gradients of the image.
+        distance_m: Way driven so far, m.
     """
 
     stamp_ns: int
     edges: Edges
     gradients: GradientPyramid
+    distance_m: float = 0.0
+
+
+NEW_SCENE_M = 20.0
+"""m driven after which a cell of the image shows other things: half of the range at which most edges lie."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeBatch:
-    """Edges of several frames in one set of arrays; ``slot`` says which frame each belongs to."""
+    """Edges of several frames in one set of arrays.
+
+    ``slot`` says which frame an edge belongs to, ``cell`` which part of the image on which stretch of road.
+    """
 
     position: Floats
     direction: Floats
@@ -88,16 +98,27 @@ class EdgeBatch:
     def __len__(self) -> int:
         return len(self.weight)
 
+    def thinned(self, stride: int) -> "EdgeBatch":
+        """Every ``stride``-th edge, the same images."""
+        fewer = {
+            name: getattr(self, name)[::stride]
+            for name in ("position", "direction", "weight", "cell", "slot")
+        }
+        return dataclasses.replace(self, **fewer)
+
 
 def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel, most_edges: int) -> EdgeBatch:
     """Joins frames of one camera, at least one; every n-th edge where there are more than ``most_edges``."""
     total = sum(len(f.edges) for f in frames)
     kept = slice(None, None, max(1, -(-total // most_edges)))
+    stretches = [int((f.distance_m - frames[0].distance_m) // NEW_SCENE_M) for f in frames]
     return EdgeBatch(
         position=np.concatenate([f.edges.position for f in frames])[kept],
         direction=np.concatenate([f.edges.direction for f in frames])[kept],
         weight=np.concatenate([f.edges.weight for f in frames])[kept],
-        cell=np.concatenate([f.edges.cell for f in frames])[kept],
+        cell=np.concatenate(
+            [f.edges.cell + CELLS * stretch for f, stretch in zip(frames, stretches, strict=True)]
+        )[kept],
         slot=np.repeat(np.arange(len(frames)), [len(f.edges) for f in frames])[kept],
         stacks=tuple(
             np.stack([f.gradients.levels[level] for f in frames])
@@ -147,7 +168,13 @@ def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Flo
     value, point_slope, points = _respond(batch, T_cam_lidar, level)
     total = float(batch.weight.sum())
     w = (batch.weight / total)[:, None]
-    share = np.concatenate([np.cross(points, point_slope), point_slope], axis=1) * w
+    share = np.empty((len(points), 6))
+    # p x s: the slope by a turn about the camera's centre (FORMULAS A2).
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        share[:, k] = points[:, i] * point_slope[:, j] - points[:, j] * point_slope[:, i]
+    share[:, 3:] = point_slope
+    share *= w
     return float(batch.weight @ value) / total, share.sum(axis=0), share
 
 
@@ -158,7 +185,8 @@ def _respond(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[Floats,
     uv, valid = cameras.project_unbounded(batch.camera, points)
     seen = np.where(valid[:, None], points, [0.0, 0.0, 1.0])
     J = cameras.projection_jacobian(batch.camera, seen)
-    step = np.einsum("nij,nj->ni", J, batch.direction @ R.T)
+    turned = batch.direction @ R.T
+    step = np.einsum("nij,nj->ni", J, turned)
     angle = np.arctan2(step[:, 1], step[:, 0])
     value, slope = sample(
         batch.stacks[level], batch.slot, np.where(valid[:, None], uv, 0.0), angle, batch.scales[level]
@@ -228,18 +256,31 @@ def _best_maximum(
     batch: EdgeBatch, T_stored: Floats, stored: float, parameters: EdgeWitnessParameters
 ) -> tuple[Floats, float]:
     """The nearest maximum, unless one that a coarser level leads to scores clearly more."""
+    nearest = _ascend(batch, T_stored, np.zeros(6), 0, parameters)
     xi, best = np.zeros(6), stored
-    for schedule in ((0,), (1, 0), (2, 1, 0)):
-        candidate = np.zeros(6)
+    thin = batch.thinned(_COARSE_STRIDE)
+    for schedule in ((), (1, 0), (2, 1, 0)):
+        candidate = nearest if not schedule else np.zeros(6)
         for level in schedule:
-            candidate = _ascend(batch, T_stored, candidate, level, parameters)
+            candidate = _ascend(thin, T_stored, candidate, level, parameters)
+        if schedule and np.linalg.norm((candidate - nearest) / UNITS) < _SAME_MODE:
+            continue
+        if schedule:
+            candidate = _ascend(batch, T_stored, candidate, 0, parameters)
         value = score(batch, se3.retract(T_stored, candidate), 0)[0]
-        far = np.linalg.norm(candidate[:3]) > parameters.farthest_rad
+        far = float(np.linalg.norm(candidate[:3])) > parameters.farthest_rad
         far = far or float(np.linalg.norm(candidate[3:])) > parameters.farthest_m
-        wanted = best if schedule == (0,) else best * (1.0 + parameters.least_gain)
+        wanted = best * (1.0 + parameters.least_gain) if schedule else best
         if value > wanted and not far:
             xi, best = candidate, value
     return xi, best
+
+
+_COARSE_STRIDE = 3
+"""Every third edge leads through the coarse levels; all of them decide."""
+
+_SAME_MODE = 1.0
+"""Alert units; maxima nearer to each other are one, found twice."""
 
 
 def _ascend(
@@ -366,7 +407,7 @@ def _covariance(batch: EdgeBatch, T: Floats, parameters: EdgeWitnessParameters) 
     values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
     H_inverse = (vectors / values) @ vectors.T
     share = score(batch, T, 0)[2] * UNITS
-    cells = np.zeros((CELL_COLUMNS * CELL_ROWS, 6))
+    cells = np.zeros((int(batch.cell.max()) + 1, 6))
     np.add.at(cells, batch.cell, share)
     G = cells.T @ cells
     C = H_inverse @ G @ H_inverse * parameters.sigma_factor**2
@@ -383,6 +424,7 @@ def _contrast(
     rng: np.random.Generator,
 ) -> float:
     """Score at the stored extrinsic over the mean at far random ones, minus 1."""
+    batch = batch.thinned(_COARSE_STRIDE)
     chance = []
     for _ in range(parameters.contrast_starts):
         axis, shift = rng.normal(size=3), rng.normal(size=3)

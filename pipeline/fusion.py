@@ -37,12 +37,12 @@ class Testimony:
         return np.asarray(np.linalg.inv(self.information + np.diag(_PRIOR_SIGMA**-2)), dtype=np.float64)
 
 
-def contradiction(a: Testimony, b: Testimony, floor: Floats) -> bool:
-    """Whether two witnesses differ by more than their errors and ``floor`` (6,6) each allow, at 1e-3."""
-    A, B = _with_floor(a.information, floor), _with_floor(b.information, floor)
+def contradiction(a: Testimony, b: Testimony) -> bool:
+    """Whether two witnesses, their own floors included, differ by more than their errors allow, at 1e-3."""
+    A, B = a.information, b.information
     parallel = A @ np.linalg.pinv(A + B, hermitian=True) @ B
     difference = a.drift - b.drift
-    rank = int(np.linalg.matrix_rank(parallel, hermitian=True))
+    rank = int(np.linalg.matrix_rank(parallel * np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA), hermitian=True))
     return rank > 0 and float(difference @ parallel @ difference) > CONTRADICTION[rank - 1]
 
 
@@ -56,6 +56,7 @@ def intersected(a: Testimony, b: Testimony) -> Testimony:
     return Testimony(np.linalg.solve(information + prior, pull), information)
 
 
-def _with_floor(information: Floats, floor: Floats) -> Floats:
+def with_floor(testimony: Testimony, floor: Floats) -> Testimony:
     """``(I^-1 + floor)^-1`` for a singular I too: a direction without information stays without."""
-    return np.asarray(information @ np.linalg.inv(np.eye(6) + floor @ information), dtype=np.float64)
+    information = testimony.information @ np.linalg.inv(np.eye(6) + floor @ testimony.information)
+    return Testimony(testimony.drift, 0.5 * (information + information.T))

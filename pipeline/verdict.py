@@ -69,6 +69,7 @@ class Memory:
         severity: Of a drift, or None.
         alarms: Alarming judgements in a row that agree.
         alarm_drift: Estimate (6,) of the last of them, or None.
+        alarmed_ns: Stamp of the first of them.
         quiet_ns: Stamp of the last judgement without suspicion (at first: of the first data).
         monitored_ns: Stamp at which every required axis was last monitored (at first: of the first data).
         last_seen_ns: Per axis the stamp at which it was last observable, or None.
@@ -83,6 +84,7 @@ class Memory:
     severity: Literal["minor", "major"] | None
     alarms: int
     alarm_drift: Floats | None
+    alarmed_ns: int
     quiet_ns: int
     monitored_ns: int
     last_seen_ns: tuple[int | None, ...]
@@ -100,6 +102,7 @@ def start(now_ns: int) -> Memory:
         severity=None,
         alarms=0,
         alarm_drift=None,
+        alarmed_ns=now_ns,
         quiet_ns=now_ns,
         monitored_ns=now_ns,
         last_seen_ns=(None,) * len(AXES),
@@ -154,7 +157,7 @@ def advance(
         # Latched: only a new extrinsic or an acknowledgement ends a drift, whatever is seen later.
         return dataclasses.replace(memory, severity=_worse(memory.severity, _severity(judgement, limits)))
     if memory.alarms >= parameters.confirmations:
-        onset = Onset((memory.quiet_ns + now_ns) // 2, memory.quiet_ns, now_ns)
+        onset = Onset((memory.quiet_ns + memory.alarmed_ns) // 2, memory.quiet_ns, memory.alarmed_ns)
         memory = dataclasses.replace(memory, onset=onset, severity=_severity(judgement, limits))
         return _enter(memory, "drift_confirmed", _drift_reason(judgement, limits), now_ns)
     if judgement.contradicted:
@@ -246,6 +249,7 @@ def _remembered(
         memory,
         alarms=alarms,
         alarm_drift=judgement.drift if judgement.alarming else None,
+        alarmed_ns=now_ns if alarms <= 1 else memory.alarmed_ns,
         quiet_ns=now_ns if calm and not judgement.blind else memory.quiet_ns,
         monitored_ns=now_ns if all_monitored else memory.monitored_ns,
         last_seen_ns=seen,

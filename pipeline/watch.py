@@ -3,6 +3,7 @@
 Pure: no files, no clock. What a stage costs is measured by the caller through ``stage``.
 """
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -12,9 +13,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pipeline import drift_test, edge_witness, fusion, line_witness, se3, verdict, window
+from pipeline.deskew import SpinSense
 from pipeline.drift_test import Evidence, Judgement
 from pipeline.edge_witness import EdgeFrame, EdgeSolution
 from pipeline.edges import RING_JUMP, find_edges
+from pipeline.ego import Ego
 from pipeline.fusion import Testimony
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground
@@ -44,8 +47,8 @@ def _unmeasured(name: str) -> AbstractContextManager[None]:
 _LEAST_EDGES = 20
 """Edges below which a frame says nothing: three per axis."""
 
-_LINES_ALONE_FRAMES = 3
-"""Frames with matched lines before lines alone may claim a drift."""
+_LINES_FRAMES = 3
+"""Frames with matched lines before lines may testify: a wrong match seldom repeats itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +63,7 @@ class Mount:
         sigma_m: Uncertainty of the stored translation per axis, m.
         limits: float64 (6,), alert limits.
         required: Axes that must be monitored for 'healthy'.
+        spin: Sense of rotation of the LiDAR where it is configured.
     """
 
     camera: CameraModel
@@ -69,6 +73,7 @@ class Mount:
     sigma_m: float
     limits: Floats
     required: tuple[str, ...]
+    spin: SpinSense | None = None
 
     @property
     def R_vehicle_cam(self) -> Floats:
@@ -146,6 +151,8 @@ class Watch:
         self.belief: Belief | None = None
         self.frames = 0
         self._segmenter = segmenter
+        ahead = mount.T_cam_lidar[2, :3]
+        self._ego = Ego(mount.up, ahead, mount.spin)
         self._edge_frames: deque[EdgeFrame] = deque()
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
         self._begun_ns = 0
@@ -206,6 +213,7 @@ class Watch:
     def _forget(self) -> None:
         self._edge_frames.clear()
         self._line_frames.clear()
+        self._ego.forget()
         self._judged_ns = None
         self._lines_ns = None
 
@@ -218,6 +226,9 @@ class Watch:
             return Findings("empty_cloud", pair.cloud, nothing, None, None, judged=False)
         self._count += 1
         rng = np.random.default_rng([self.parameters.seed, self._count])
+        with stage("motion"):
+            straight = self._ego.straighten(pair)
+        pair = dataclasses.replace(pair, cloud=straight.cloud)
         with stage("ground"):
             ground = fit_ground(pair.cloud, mount.up, rng)
         with stage("edges"):
@@ -227,7 +238,7 @@ class Watch:
         if edges is not None and enough:
             with stage("gradients"):
                 gradients = gradient_pyramid(pair.image, mount.camera)
-            self._edge_frames.append(EdgeFrame(pair.image_stamp_ns, edges, gradients))
+            self._edge_frames.append(EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m))
         found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
         dropped: DropReason | None = None
         if not enough and not found_lines:
@@ -312,28 +323,26 @@ class Watch:
         edges = self._solve_edges(B.T @ (floor + C_ref) @ B)
         lines = self._solve_lines()
         edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
-        lines_drift = None if lines is None else _testimony(lines.estimate.xi, lines.estimate.information, B)
+        lines_drift = None
+        if lines is not None:
+            own = _testimony(lines.estimate.xi, lines.estimate.information, B)
+            lines_drift = fusion.with_floor(own, test.lines_floor())
         if edges_drift is None and lines_drift is None:
             return None
         contradicted = False
         if edges_drift is not None and lines_drift is not None:
-            contradicted = fusion.contradiction(edges_drift, lines_drift, floor)
+            contradicted = fusion.contradiction(fusion.with_floor(edges_drift, floor), lines_drift)
         fused = edges_drift or lines_drift
         assert fused is not None  # noqa: S101 - one of the two is there
         if edges_drift is not None and lines_drift is not None and not contradicted:
             fused = fusion.intersected(edges_drift, lines_drift)
         T_estimated = se3.retract(mount.T_cam_lidar, B.T @ fused.drift)
-        alone = edges is None
         evidence = Evidence(
             drift=se3.mount_drift(mount.T_cam_lidar, T_estimated, R_vc),
             covariance=fused.covariance(),
             loss=np.inf if edges is None else edges.loss,
             contrast=np.inf if edges is None else _contrast_at_estimate(edges),
-            persistent=(
-                lines is not None and lines.estimate.frames >= _LINES_ALONE_FRAMES
-                if alone or edges is None
-                else min(edges.block_gains, default=0.0) > 0.0
-            ),
+            persistent=edges is None or min(edges.block_gains, default=0.0) > 0.0,
             frames=len(self._edge_frames),
             contradicted=contradicted,
         )
@@ -356,12 +365,13 @@ class Watch:
         return edge_witness.solve(batch, self.mount.T_cam_lidar, floor, settings, rng)
 
     def _solve_lines(self) -> LineSolution | None:
-        if not self._line_frames:
+        # Lines of before the window would testify to another mount.
+        since = self._edge_frames[0].stamp_ns if self._edge_frames else 0
+        frames = [frame for stamp, frame in self._line_frames if stamp >= since]
+        if not frames:
             return None
-        solution = line_witness.solve_lines(
-            [frame for _, frame in self._line_frames], self.mount.camera, self.mount.T_cam_lidar
-        )
-        return solution if solution.estimate.features > 0 else None
+        solution = line_witness.solve_lines(frames, self.mount.camera, self.mount.T_cam_lidar)
+        return solution if solution.estimate.frames >= _LINES_FRAMES else None
 
 
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:

@@ -35,13 +35,16 @@ def retained(stamps_ns: list[int], parameters: WindowParameters) -> list[int]:
     count = len(stamps_ns)
     newest = stamps_ns[-1]
     kept: list[int] = []
-    # From the newest backwards: each older frame must stand clear of the one kept before it.
+    taken: set[int] = set()
     for index in range(count - 1, -1, -1):
         if newest - stamps_ns[index] > parameters.longest_ns or len(kept) == parameters.most_frames:
             break
-        dense = count - 1 - index < parameters.dense_frames
-        if dense or stamps_ns[kept[-1]] - stamps_ns[index] >= parameters.spacing_ns:
+        # Older frames share fixed slots of time, one each, so that the one kept now is kept next time too.
+        slot = stamps_ns[index] // parameters.spacing_ns
+        if count - 1 - index < parameters.dense_frames or slot not in taken:
             kept.append(index)
+        if count - 1 - index >= parameters.dense_frames:
+            taken.add(slot)
     return kept[::-1]
 
 

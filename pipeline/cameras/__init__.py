@@ -49,9 +49,16 @@ def lens_models() -> dict[str, LensModel]:
     return found
 
 
+_BENT_BY_NATURE = ("equidistant", "fisheye")
+"""Lenses that map angles, not slopes, so that coefficients of zero do not make a pinhole."""
+
+
 def lens_of(camera: CameraModel) -> LensModel:
     """The lens model of a camera; InputError names those that exist."""
     models = lens_models()
+    if camera.model in models and not camera.D.any():
+        # plumb_bob with zeros is how rectified images are announced; a bare fisheye is none the less bent.
+        return models["pinhole"] if camera.model not in _BENT_BY_NATURE else models[camera.model]
     if camera.model not in models:
         raise InputError(
             f"camera model '{camera.model}' is not known", hint=f"known: {', '.join(sorted(models))}"

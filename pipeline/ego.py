@@ -1,0 +1,147 @@
+"""The ego motion of the LiDAR, tracked from sweep to sweep, and sweeps straightened by it (FORMULAS G3).
+
+A cloud with times per point is straightened by them. One without is straightened by its azimuths where the sense of
+rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.deskew import Spin, SpinSense, Twist, deskew, sweep_times
+from pipeline.motion import (
+    Motion,
+    SpinEvidence,
+    Surfels,
+    estimate_twist,
+    spin_evidence,
+    spin_sense,
+    surfels,
+)
+from pipeline.records import Floats, FramePair, PointCloud
+
+_NS = 1e9
+
+_LONGEST_REACH_S = 0.3
+"""s; a sweep is not moved further than this to the exposure: beyond it the twist of now is a guess."""
+
+_TRACK_EVERY_NS = 300_000_000
+"""ns; a registration holds so long: at 3 m/s^2 a sweep is then bent wrongly by 2 cm at its ends, at most."""
+
+_MOST_EVIDENCE = 12
+"""Pairs of sweeps that are asked for the sense of rotation; a vehicle that stands never tells it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Straightened:
+    """A sweep at the instant of its image.
+
+    Attributes:
+        cloud: The sweep, brought to the exposure where that was possible.
+        straight: Whether it was.
+        distance_m: Way driven since the start, m, as far as the motion was known.
+    """
+
+    cloud: PointCloud
+    straight: bool
+    distance_m: float
+
+
+class Ego:
+    """Tracks one LiDAR.
+
+    Args:
+        axis: float64 (3,), unit, LiDAR frame: the spin axis, upwards.
+        ahead: float64 (3,), LiDAR frame: where the camera looks.
+        spin: Sense of rotation where it is configured.
+    """
+
+    def __init__(self, axis: Floats, ahead: Floats, spin: SpinSense | None) -> None:
+        self._axis = axis
+        self._ahead = ahead
+        self._sense: SpinSense | None = spin
+        self._asked = spin is not None
+        self._evidence: list[SpinEvidence] = []
+        self._tried = 0
+        self._previous: tuple[int, PointCloud | Surfels] | None = None
+        self._tracked_ns: int | None = None
+        self._twist: Twist | None = None
+        self._distance_m = 0.0
+
+    @property
+    def twist(self) -> Twist | None:
+        """Motion at the last registration, or None where it is not known."""
+        return self._twist
+
+    def forget(self) -> None:
+        """The stream was interrupted: the next sweep stands alone."""
+        self._previous = None
+        self._tracked_ns = None
+        self._twist = None
+
+    def straighten(self, pair: FramePair) -> Straightened:
+        """Tracks the motion up to this sweep, and brings the sweep to the exposure of its image."""
+        seen: PointCloud | Surfels = pair.cloud
+        if self._previous is not None:
+            seen = self._advance(pair, *self._previous)
+        self._previous = (pair.cloud_stamp_ns, seen)
+        cloud = self._at_exposure(pair)
+        return Straightened(cloud or pair.cloud, cloud is not None, self._distance_m)
+
+    def _advance(self, pair: FramePair, before_ns: int, before: PointCloud | Surfels) -> PointCloud | Surfels:
+        """Registers this sweep with the one before when that is due; gives what the next one needs of it."""
+        seconds = (pair.cloud_stamp_ns - before_ns) / _NS
+        if seconds <= 0:
+            self.forget()
+            return pair.cloud
+        held = self._tracked_ns is not None and pair.cloud_stamp_ns - self._tracked_ns < _TRACK_EVERY_NS
+        seen: PointCloud | Surfels = pair.cloud
+        if not held or self._asks(pair):
+            earlier = before if isinstance(before, Surfels) else surfels(before)
+            seen = surfels(pair.cloud)
+            self._register(pair, earlier, seen, seconds)
+        if self._twist is not None:
+            self._distance_m += float(np.linalg.norm(self._twist.velocity)) * seconds
+        return seen
+
+    def _register(self, pair: FramePair, before: Surfels, seen: Surfels, seconds: float) -> None:
+        found = estimate_twist(before, seen, seconds, self._twist)
+        self._twist = found.twist if isinstance(found, Motion) else None
+        self._tracked_ns = pair.cloud_stamp_ns if self._twist is not None else None
+        if self._asks(pair) and self._twist is not None and pair.sweep_s is not None:
+            self._ask(spin_evidence(before, seen, seconds, pair.sweep_s, self._axis, self._twist))
+
+    def _asks(self, pair: FramePair) -> bool:
+        """Whether the sense of rotation is still open and this sweep may tell it."""
+        return not self._asked and pair.cloud.time is None and pair.sweep_s is not None
+
+    def _ask(self, answer: object) -> None:
+        """Collects what sweeps say of the sense of rotation until it is sure or asked often enough."""
+        self._tried += 1
+        if isinstance(answer, SpinEvidence):
+            self._evidence.append(answer)
+        told = spin_sense(self._evidence)
+        self._asked = told is not None or self._tried >= _MOST_EVIDENCE
+        if told == "cw" or told == "ccw":  # noqa: PLR1714 - narrows the type
+            self._sense = told
+
+    def _at_exposure(self, pair: FramePair) -> PointCloud | None:
+        if self._twist is None:
+            return None
+        reference_s = (pair.image_stamp_ns - pair.cloud_stamp_ns) / _NS
+        time = self._times(pair)
+        if time is None or abs(reference_s - float(np.median(time))) > _LONGEST_REACH_S:
+            return None
+        return deskew(pair.cloud, time, self._twist, reference_s)
+
+    def _times(self, pair: FramePair) -> np.ndarray | None:
+        """When each point was measured; by azimuth a turn begins straight behind the camera.
+
+        Cameras beside spinning LiDARs are triggered, or chosen, when the beams look their way, in the middle of
+        the turn whose stamp the pair carries.
+        """
+        if pair.cloud.time is not None:
+            return pair.cloud.time
+        if self._sense is None or pair.sweep_s is None:
+            return None
+        return sweep_times(pair.cloud, pair.sweep_s, Spin(self._sense, self._axis, -self._ahead))

@@ -1,16 +1,21 @@
 """Recordings over the bus: the same messages come out, in the same order, however slow the reader is."""
 
+import os
 import threading
+from pathlib import Path
 
 import pytest
 
 from monitor import bus_replay
 from monitor.bus import BusSettings, listening_at, open_session
 from monitor.bus_replay import WINDOW, OverBus, Pace, ReplayReader, ReplayWriter
+from monitor.intake import Intake
 from monitor.messages import Message
-from monitor.sources import Losses, Tick, TopicInfo
+from monitor.preparation import prepare
+from monitor.sources import Losses, Tick, TopicInfo, open_source
 from pipeline.errors import InputError, TransportError
 
+DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[3] / "shared" / "data"))
 KINDS = (
     ("/lidar/points", "sensor_msgs/msg/PointCloud2", "cdr"),
     ("/cam", "foxglove.CompressedImage", "protobuf"),
@@ -84,6 +89,28 @@ def test_every_message_comes_out_as_it_went_in_and_in_order():
     assert over.losses.counts == {"damaged_chunk": 2}
     assert over.losses.notes == ["2 chunks are damaged"]
     assert source.closed
+
+
+@pytest.mark.recordings
+@pytest.mark.skipif(not DATA.is_dir(), reason="no recordings folder (CALIBWATCH_DATA)")
+@pytest.mark.parametrize(
+    "name", ["kitti_raw_0009_mcap/kitti_0009.mcap", "kitti_raw_0005_a", "nuscenes_mmdet3d"]
+)
+def test_a_real_recording_gives_the_same_pairs_over_the_bus(name):
+    rig = prepare(str(DATA / name), None, None).rig
+
+    def pairs(opened):
+        intake = Intake(rig)
+        with opened as source:
+            found = [pair for message in source for pair in intake.take(message)] + intake.flush()
+        return [
+            (p.pair, p.cloud_stamp_ns, p.image_stamp_ns, p.cloud.xyz.tobytes(), p.image.pixels.tobytes())
+            for p in found
+        ]
+
+    direct = pairs(open_source(str(DATA / name)))
+    assert len(direct) > 5
+    assert pairs(OverBus(open_source(str(DATA / name)), "test")) == direct
 
 
 def test_the_writer_never_runs_ahead_of_what_the_reader_has_used():

@@ -328,6 +328,24 @@ def test_a_fault_in_a_thread_is_told_and_ends_its_input_alone(sessions, monkeypa
     assert "zenoh points ended: broken" in source.losses.notes[0]
 
 
+def test_a_router_that_starts_again_is_found_again():
+    first = open_session(BusSettings(mode="router", listen=("tcp/127.0.0.1:0",)))
+    endpoints = listening_at(first)
+    with (
+        open_session(BusSettings(connect=endpoints)) as session,
+        live(session, Subscription("/points", ("points",))) as source,
+    ):
+        items = iter(source)
+        first.close()
+        with (
+            open_session(BusSettings(mode="router", listen=endpoints)),
+            open_session(BusSettings(connect=endpoints)) as other,
+        ):
+            matched(other, "points")
+            put(other, "points", 3)
+            assert next(items).sequence == 3
+
+
 def test_an_endpoint_is_a_source(sessions):
     here, there = sessions
     (endpoint,) = listening_at(here)

@@ -153,11 +153,6 @@ def survey_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo]) -
     return survey
 
 
-def discover_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo]) -> Discovery:
-    """What the beginning of a recording allows to be watched; see :func:`survey_in`."""
-    return discover(survey_in(messages, topics))
-
-
 def discover(survey: Survey) -> Discovery:
     """Pairs every cloud topic with every image topic whose frames tf connects."""
     missing = [f"topic {topic}: {why}" for topic, why in sorted(survey.undecodable.items())]

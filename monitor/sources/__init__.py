@@ -1,7 +1,8 @@
 """Sources: where messages come from. Every module here offers ``SOURCE`` (a :class:`SourceKind`).
 
-A source is opened once and iterated once; it yields :class:`~monitor.messages.Message` in the order of log time, and
-:class:`Tick` when nothing came for a period (live sources only). It is a context manager: leaving it frees the file.
+A source is opened once and iterated once; it yields :class:`~monitor.messages.Message` in the order of log
+time, and :class:`Tick` when nothing came for a period (live sources only). It is a context manager: leaving it
+frees the file.
 """
 
 import importlib
@@ -9,6 +10,7 @@ import pkgutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -101,6 +103,8 @@ def open_source(location: str) -> Source:
     for kind in kinds():
         if kind.matches(location):
             return kind.open(location)
+    if not Path(location).exists():
+        raise InputError(f"{location} does not exist")
     raise InputError(
         f"{location} is not a recording that is understood",
         hint="understood: .mcap, .bag, rosbag2 folder, KITTI raw drive folder, folder with calib.json",

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from monitor.discovery import Survey, compose, discover, discover_in, path
+from monitor.discovery import Survey, compose, discover, path, survey_in
 from monitor.messages import CameraInfo, Transform
 from monitor.sources import mcap_file
 from pipeline.records import CameraModel
@@ -128,7 +128,7 @@ def test_several_sensors_get_names_of_their_own():
 @pytest.mark.skipif(not DATA.is_dir(), reason="no recordings folder (CALIBWATCH_DATA)")
 def test_a_recording_that_this_project_did_not_write():
     with mcap_file.SOURCE.open(str(DATA / "kitti_raw_0009_mcap" / "kitti_0009.mcap")) as source:
-        found = discover_in(source, source.describe())
+        found = discover(survey_in(source, source.describe()))
     (pair,) = found.rig.pairs
     calib = json.loads((DATA / "kitti_raw_0009_a" / "calib.json").read_text())
     T = np.array(calib["T_cam_lidar"])

@@ -157,6 +157,8 @@ def test_every_kind_of_source_has_a_name_of_its_own_and_refuses_what_is_nothing(
     assert not any(kind.matches(str(tmp_path)) for kind in kinds())
     with pytest.raises(InputError, match="is not a recording"):
         open_source(str(tmp_path))
+    with pytest.raises(InputError, match="absent does not exist"):
+        open_source(str(tmp_path / "absent"))
 
 
 EXPECTED = {

@@ -9,18 +9,13 @@ CODECS: dict[str, Codec] = {}
 _LITERALS = 0x20
 """Control bytes below it announce that many bytes, plus one, as they are."""
 
-_LONGEST_COPY = 264
-"""Bytes that one instruction of three bytes can yield: nothing expands by more than 88."""
-
 
 def decompress(data: memoryview, size: int) -> bytearray:
-    """The ``size`` bytes that ``data`` hold.
+    """The ``size`` bytes that ``data`` hold; what is allocated grows with what was found, not with ``size``.
 
     Raises:
         InputError: The data do not yield exactly ``size`` bytes.
     """
-    if size > len(data) * _LONGEST_COPY // 3 + _LONGEST_COPY:
-        raise InputError(f"{len(data)} compressed bytes can not hold {size}", hint="the file is damaged")
     source = bytes(data)
     out = bytearray()
     at, end = 0, len(source)

@@ -41,11 +41,18 @@ EXACT = {
     "8UC1": (GREY, np.dstack([GREY] * 3)),
     **{f"bayer_{p}8": (mosaic(p), colour(40, 90, 200)) for p in ("rggb", "bggr", "gbrg", "grbg")},
 }
+
+
+def widened(pixels):
+    """16 bits whose upper byte is the pixel; the lower one would show if the bytes were swapped."""
+    return (pixels.astype(np.uint16) << 8) | 0x7F
+
+
 WIDE = {
-    "mono16": (GREY.astype(np.uint16) << 8, np.dstack([GREY] * 3)),
-    "bgr16": (BGR.astype(np.uint16) << 8, BGR),
-    "rgb16": (BGR[:, :, ::-1].astype(np.uint16) << 8, BGR),
-    **{f"bayer_{p}16": (mosaic(p).astype(np.uint16) << 8, colour(40, 90, 200)) for p in ("rggb", "grbg")},
+    "mono16": (widened(GREY), np.dstack([GREY] * 3)),
+    "bgr16": (widened(BGR), BGR),
+    "rgb16": (widened(BGR[:, :, ::-1]), BGR),
+    **{f"bayer_{p}16": (widened(mosaic(p)), colour(40, 90, 200)) for p in ("rggb", "grbg")},
 }
 
 
@@ -217,6 +224,13 @@ def test_a_png_chunk_that_declares_more_than_there_is_is_refused_before_it_is_de
         decode(wire.file("png", bytes(data)))
 
 
+def test_a_png_with_a_wrong_sum_is_refused_before_it_is_decoded():
+    data = bytearray(written("png"))
+    data[-20] ^= 1
+    with pytest.raises(InputError, match="damaged between bytes"):
+        decode(wire.file("png", bytes(data)))
+
+
 def test_an_animation_is_refused():
     data = written("png")
     chunk = b"acTL" + struct.pack(">II", 1, 0)
@@ -229,7 +243,7 @@ def test_a_jpeg_that_declares_a_huge_size_is_refused_before_it_is_decoded():
     data = bytearray(written("jpg"))
     at = data.index(b"\xff\xc0")
     data[at + 5 : at + 9] = b"\xff\xff\xff\xff"
-    with pytest.raises(InputError, match="65535x65535 px"):
+    with pytest.raises(InputError, match="an image of 65535x65535 px"):
         decode(wire.file("jpg", bytes(data)))
 
 

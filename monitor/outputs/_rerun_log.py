@@ -1,7 +1,7 @@
 """What a recording holds, as entities of rerun: the only module that imports it; loaded by an open recording.
 
 Entities per pair: ``image`` (the picture), ``image/masks``, ``image/lines``, ``image/stored`` and
-``image/estimated`` (the cloud, projected by our lens model, and matched lines); ``lidar/points``,
+``image/estimated`` (cloud, edges of range and matched lines, projected by our lens model); ``lidar/points``,
 ``lidar/lines`` and the camera under both extrinsics; ``drift/<axis>``; ``state`` and ``log``.
 """
 
@@ -14,6 +14,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from monitor.events import FrameEvent
+from monitor.outputs._pipe_to_file import PipeToFile
 from monitor.status import AXIS_NAMES, STATES, AxisName, Status, unit_of
 from pipeline import labels, se3
 from pipeline.cameras import project, raw_pixels
@@ -45,10 +46,15 @@ _FRUSTUM_M = 0.6
 """m; how far in front of the camera its picture plane is drawn."""
 _FLUSH_TIMEOUT_S = 5.0
 """s; a disk that takes longer than this for the data of one period is as good as lost."""
+_CLOSE_TIMEOUT_S = 20.0
+"""s; what the end of a file may take."""
 
 
 class RerunLog:
-    """An open file of rerun. RuntimeError or OSError where it can not be opened.
+    """An open file of rerun. OSError where it can not be opened.
+
+    rerun's own file writer raises nothing when the disk fills up and may hang for ever when it is closed after
+    that: its bytes go through a pipe instead.
 
     Args:
         path: The file.
@@ -56,10 +62,16 @@ class RerunLog:
     """
 
     def __init__(self, path: Path, vehicle: str) -> None:
-        self._rec = rr.RecordingStream("calibwatch", recording_id=f"{vehicle}-{path.stem}")
+        self._rec = rr.RecordingStream("calibwatch")
         self._rec.set_log_time_enabled(enabled=False)
         self._rec.set_log_tick_enabled(enabled=False)
-        self._rec.save(path)
+        self._pipe = PipeToFile(path)
+        try:
+            self._rec.save(self._pipe.source)
+        except RuntimeError as error:
+            raise OSError(f"rerun can not write: {error}") from error
+        finally:
+            self._pipe.opened()
         self._rec.send_recording_name(vehicle)
         self._pairs: list[str] = []
         self._states: dict[str, str] = {}
@@ -118,10 +130,16 @@ class RerunLog:
             self._rec.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, ValueError) as error:
             raise OSError(str(error)) from error
+        if self._pipe.error is not None:
+            raise OSError(str(self._pipe.error)) from self._pipe.error
 
     def close(self) -> None:
-        """Ends the file."""
+        """Ends the file; OSError where it is not whole."""
         self._rec.disconnect()
+        if not self._pipe.join(_CLOSE_TIMEOUT_S):
+            raise OSError(f"the disk took more than {_CLOSE_TIMEOUT_S:.0f} s for the end of the file")
+        if self._pipe.error is not None:
+            raise OSError(str(self._pipe.error)) from self._pipe.error
 
     def _at(self, stamp_ns: int) -> None:
         """Everything that this thread logs from here on has this stamp."""
@@ -129,11 +147,11 @@ class RerunLog:
         self._rec.set_time("stamp", timestamp=np.datetime64(stamp_ns, "ns"))
 
     def _projected(self, frame: FrameEvent, name: str, T: Floats, colour: tuple[int, int, int]) -> None:
-        """The cloud and the matched lines in the image under one extrinsic."""
-        cloud = np.concatenate([_thinned(frame.points), _thinned(frame.edge_points)])
-        uv, inside = project(frame.camera, se3.apply(T, cloud))
-        path = _path(frame.pair, "image", name)
-        self._rec.log(path, rr.Points2D(uv[inside].astype(np.float32), colors=colour, radii=1.2))
+        """The cloud, its edges and the matched lines in the image under one extrinsic."""
+        for part, cloud, radius in (("cloud", frame.points, 0.7), ("edges", frame.edge_points, 1.8)):
+            uv, inside = project(frame.camera, se3.apply(T, _thinned(cloud)))
+            path = _path(frame.pair, "image", name, part)
+            self._rec.log(path, rr.Points2D(uv[inside].astype(np.float32), colors=colour, radii=radius))
         lines = [
             project(frame.camera, se3.apply(T, _samples(match.cloud.start, match.cloud.end)))[0]
             for match in frame.matches
@@ -180,7 +198,11 @@ class RerunLog:
             return
         self._pairs.append(pair)
         classes = [
-            (index, labels.NAMES[index], labels.COLOURS_RGB[index]) for index in (labels.LANE, labels.POLE)
+            (labels.OTHER, labels.NAMES[labels.OTHER], (0, 0, 0, 0)),  # lets the picture through
+            *(
+                (index, labels.NAMES[index], labels.COLOURS_RGB[index])
+                for index in (labels.LANE, labels.POLE)
+            ),
         ]
         self._rec.log(_path(pair, "image"), rr.AnnotationContext(classes), static=True)
         style = rr.SeriesLines(names=list(_SERIES), colors=list(_SERIES_RGB), widths=list(_SERIES_WIDTHS))
@@ -248,4 +270,8 @@ def _blueprint(pairs: list[str]) -> rrb.Blueprint:
 
 
 def _drift_view(pair: str, name: AxisName) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin=_path(pair, "drift", name), name=f"{name} [{unit_of(name)}]")
+    return rrb.TimeSeriesView(
+        origin=_path(pair, "drift", name),
+        name=f"{name} [{unit_of(name)}], red: limits",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )

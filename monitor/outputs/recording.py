@@ -1,10 +1,10 @@
 """``recording.rrd``: what was seen and said, for the viewer of rerun.
 
 Data go through a bounded queue to a thread of their own: the engine never waits for the disk. A full queue
-drops its oldest event of the kind that comes. A second thread flushes on a timer, for a file that fills up
-raises nothing until it is flushed; a failed flush means that the recording is lost, which
-:attr:`Recording.lost` says. Nothing listens on the network, and the part of rerun that writes files sends no
-analytics (its viewer does until ``rerun analytics disable`` was run).
+drops its oldest event of the kind that comes. A second thread flushes on a timer, so that a kill loses little
+and a full disk is noticed soon: the recording is then lost, which :attr:`Recording.lost` says. Nothing listens
+on the network, and the part of rerun that writes files sends no analytics (its viewer does until ``rerun
+analytics disable`` was run).
 """
 
 import threading
@@ -96,10 +96,7 @@ class Recording:
     def _open(self, vehicle: str) -> "RerunLog":
         from monitor.outputs._rerun_log import RerunLog  # noqa: PLC0415 # see TYPE_CHECKING above
 
-        try:
-            return RerunLog(self._partial, vehicle)
-        except RuntimeError as error:
-            raise OSError(f"{self._partial} can not be written: {error}") from error
+        return RerunLog(self._partial, vehicle)
 
     def _too_soon(self, frame: FrameEvent) -> bool:
         last_ns = self._kept_ns.get(frame.pair)
@@ -143,7 +140,10 @@ class Recording:
                 "WARN", f"{self._dropped} frames or statuses were dropped: the disk was slower than the data"
             )
         self._flush()
-        self._log.close()
+        try:
+            self._log.close()
+        except OSError as error:
+            self._lose(str(error))
 
     def _write(self) -> None:
         """Body of the writing thread: takes events until the end has come and the queue is empty."""

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.outputs._places import best_places, within
@@ -65,6 +65,7 @@ def test_extrinsics_that_agree_are_shown_at_clear_edges_too():
     assert first.apart_px == 0.0
 
 
+@settings(max_examples=25)  # a tenth of a second each
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4))
 def test_places_lie_in_the_image_apart_from_each_other_and_tell_the_truth(seed, most):
     rng = np.random.default_rng(seed)

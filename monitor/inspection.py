@@ -25,8 +25,7 @@ from monitor.inspection_report import (
 from monitor.messages import CameraInfo, Message, decode
 from monitor.messages.header import header_stamp_ns
 from monitor.preparation import prepare
-from monitor.rig import Rig, RigPair, camera_from_info, is_cloud
-from monitor.rig_document import SweepStamp
+from monitor.rig import Rig, RigPair, camera_from_info, is_cloud, load_rig
 from monitor.sources import Source, Tick, TopicInfo, kinds, open_source
 from monitor.sources.kitti_raw import NOMINAL_PERIOD_NS
 from monitor.sync import middle_ns, pairer_for
@@ -108,7 +107,11 @@ def _rig(
         if rig_file is not None:
             raise
         return None, {}, (str(error),)
-    return prepared.rig, {pair.name: "; ".join(prepared.notes) for pair in prepared.rig.pairs}, ()
+    open_ones = (
+        () if rig_file is None else (p.name for p in load_rig(rig_file).pairs if p.T_cam_lidar is None)
+    )
+    how = {pair.name: "; ".join(prepared.notes) for pair in prepared.rig.pairs}
+    return prepared.rig, how | {name: f"{how[name]}; extrinsic from tf" for name in open_ones}, ()
 
 
 def _read_through(source: Source) -> tuple[dict[str, _Seen], Survey]:
@@ -170,8 +173,10 @@ def _cloud(seen: _Seen, topic: str, rig: Rig | None) -> CloudReport:
     first = next((cloud for cloud in clouds if len(cloud)), clouds[0])
     sizes = [len(cloud) for cloud in clouds]
     pair = next((pair for pair in (rig.pairs if rig else ()) if pair.lidar.topic == topic), None)
-    convention: SweepStamp = "start" if pair is None else pair.lidar.stamp
-    middles = [middle_ns(stamp, cloud, sweep, convention) - stamp for stamp, cloud, sweep in seen.clouds]
+    middles = [
+        (middle_ns(stamp, cloud, sweep, pair.lidar.stamp) if pair else middle_ns(stamp, cloud, sweep)) - stamp
+        for stamp, cloud, sweep in seen.clouds
+    ]
     spans = [float(np.ptp(cloud.time)) for cloud in clouds if cloud.time is not None and len(cloud)]
     told = [sweep for _, _, sweep in seen.clouds if sweep is not None]
     return CloudReport(

@@ -92,7 +92,7 @@ class PairReport(_Part):
         description="a folder whose images bear the stamps of the sweeps: no gap can be told"
     )
     gap_ms: float | None = Field(
-        description="image stamp minus middle of the sweep (its stamp where that is null), median over the pairs"
+        description="image stamp minus middle of the sweep (where that is null: its stamp), median of pairs"
     )
     nearest_ms: float | None = Field(description="the same over every image and the sweep nearest to it")
     clock_offset_ms: float | None = Field(

@@ -246,9 +246,9 @@ def _pair(section: PairSection, where: str) -> RigPair:
             rectified=section.camera.rectified,
             model=_camera_model(section.camera, f"{where}.camera"),
         ),
-        T_cam_lidar=_rigid(extrinsic.T_cam_lidar, f"{where}.extrinsic.T_cam_lidar"),
+        T_cam_lidar=rigid(extrinsic.T_cam_lidar, f"{where}.extrinsic.T_cam_lidar"),
         store=extrinsic.store,
-        T_vehicle_lidar=_rigid(section.T_vehicle_lidar, f"{where}.T_vehicle_lidar"),
+        T_vehicle_lidar=rigid(section.T_vehicle_lidar, f"{where}.T_vehicle_lidar"),
         sigma_rad=math.radians(extrinsic.sigma_deg),
         sigma_m=extrinsic.sigma_m,
         limits=np.array([*map(math.radians, degrees), limits.forward_m, limits.left_m, limits.up_m]),
@@ -277,7 +277,7 @@ def _camera_model(section: CameraSection, where: str) -> CameraModel | None:
     return camera
 
 
-def _rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
+def rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
     """A rigid motion; small rounding is taken out, anything else refused."""
     if rows is None:
         return None
@@ -285,7 +285,9 @@ def _rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
     if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise RigError(f"{where}: the last row is {T[3].tolist()}", hint="it must be [0, 0, 0, 1]")
     R = T[:3, :3]
-    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    # Products of huge entries overflow; an entry beyond 1 is wrong by itself.
+    largest = float(np.abs(R).max())
+    error = largest - 1.0 if largest > 2.0 else float(np.abs(R @ R.T - np.eye(3)).max())
     if error > _ROUNDING:
         raise RigError(
             f"{where}: the rotation is not orthonormal (off by {error:.2g})",

@@ -51,7 +51,9 @@ def inject_option(function: Callable[..., object]) -> Callable[..., object]:
 def model_option(function: Callable[..., object]) -> Callable[..., object]:
     """``--model FILE``."""
     return click.option(
-        "--model", type=click.Path(path_type=Path), help="Segmentation network (.onnx); default: the one that ships."
+        "--model",
+        type=click.Path(path_type=Path),
+        help="Segmentation network (.onnx); default: the one that ships.",
     )(function)
 
 

@@ -127,8 +127,8 @@ def _gap(pair: "PairReport", lidar: "TopicReport") -> str:
     if pair.gap_ms is None:
         return ""
     known = lidar.cloud is not None and lidar.cloud.middle_ms is not None
-    since = "the middle of its sweep" if known else "the stamp of its sweep (whose duration is not known)"
-    return f", image {pair.gap_ms:+.1f} ms from {since} (median)"
+    since = "the middle of its sweep" if known else "its sweep's stamp, the duration being unknown"
+    return f", image by median {pair.gap_ms:+.1f} ms from {since}"
 
 
 def _frame(frame: str) -> str:

@@ -5,13 +5,13 @@ covariance: noise of both lines (FORMULAS D1) and the uncertainty of the extrins
 dropped: a missing line widens the answer, a wrong one bends it.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline import plk, se3
+from pipeline import plk
 from pipeline.records import CameraModel, CloudLine, Floats, ImageLine, LineMatch
 
 REFERENCE_FOCAL_PX = 720.0
@@ -66,28 +66,17 @@ def associate(
     Returns:
         The pairs; none is an ordinary answer.
     """
-    rows: list[tuple[int, int]] = []
-    candidates: list[plk.LinePairs] = []
-    for i, cloud in enumerate(cloud_lines):
-        for j, image in enumerate(image_lines):
-            pair = pair_on_overlap(cloud, image, camera, T_cam_lidar) if cloud.label == image.label else None
-            if pair is not None:
-                rows.append((i, j))
-                candidates.append(pair)
+    rows, candidates = pairs_on_overlap(cloud_lines, image_lines, camera, T_cam_lidar)
+    if len(rows) == 0:
+        return Association((), NO_PAIRS)
     cost = np.full((len(cloud_lines), len(image_lines)), np.inf)
-    if candidates:
-        for (i, j), value in zip(
-            rows, _costs(plk.stack(candidates), camera, T_cam_lidar, covariance), strict=True
-        ):
-            cost[i, j] = value
+    cost[rows[:, 0], rows[:, 1]] = _costs(candidates, camera, T_cam_lidar, covariance)
     unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
-    chosen = [
-        k
-        for k, (i, j) in enumerate(rows)
-        if np.isfinite(cost[i, j]) and _wins(cost, image_lines, (i, j), unit)
-    ]
-    matches = tuple(LineMatch(cloud_lines[rows[k][0]], image_lines[rows[k][1]]) for k in chosen)
-    return Association(matches, plk.stack([candidates[k] for k in chosen]) if chosen else NO_PAIRS)
+    chosen = np.array(
+        [bool(np.isfinite(cost[i, j])) and _wins(cost, image_lines, (i, j), unit) for i, j in rows.tolist()]
+    )
+    matches = tuple(LineMatch(cloud_lines[i], image_lines[j]) for i, j in rows[chosen].tolist())
+    return Association(matches, plk.select(candidates, chosen))
 
 
 NO_PAIRS = plk.LinePairs(
@@ -124,7 +113,7 @@ def _wins(cost: Floats, image_lines: Sequence[ImageLine], pair: tuple[int, int],
 
 
 def _gap(line: ImageLine, other: ImageLine, unit: float) -> float | None:
-    """Distance along a line to a piece that continues it, px, negative where they overlap; None if it is none."""
+    """Distance along a line to a piece that continues it, px, negative where they overlap; None if none."""
     along = line.end - line.start
     length = float(np.linalg.norm(along))
     along = along / length
@@ -137,48 +126,115 @@ def _gap(line: ImageLine, other: ImageLine, unit: float) -> float | None:
     return float(max(position[0] - length, -position[1]))
 
 
-def pair_on_overlap(
-    cloud: CloudLine, image: ImageLine, camera: CameraModel, T_cam_lidar: Floats
-) -> plk.LinePairs | None:
-    """One pair, cut to the part of the image line that the cloud line covers, with its covariance (D1).
+def pairs_on_overlap(
+    cloud_lines: Sequence[CloudLine],
+    image_lines: Sequence[ImageLine],
+    camera: CameraModel,
+    T_cam_lidar: Floats,
+) -> tuple[NDArray[np.int64], plk.LinePairs]:
+    """Every pair of one class that has enough in common, cut to it, with its covariance (FORMULAS D1).
 
     Positions of the image ends on the cloud line follow from the projection: 1/depth is linear along the
     image line. They need no more than the gate's accuracy.
 
     Returns:
-        The pair, or None where the two have too little in common.
+        Indices (M,2) of cloud and image line, and the M pairs.
     """
-    ends = se3.apply(T_cam_lidar, np.stack([cloud.start, cloud.end]))
-    length = float(np.linalg.norm(ends[1] - ends[0]))
-    depth = ends[:, 2]
-    if depth.max() <= MIN_DEPTH_M or length < MIN_DEPTH_M / 2:
-        return None
-    # Share of the way from start to end where the depth limit cuts the line.
-    cut = np.array([0.0, 1.0])
-    for k in np.flatnonzero(depth < MIN_DEPTH_M):
-        cut[k] = (MIN_DEPTH_M - depth[0]) / (depth[1] - depth[0])
-    ends = ends[0] + cut[:, None] * (ends[1] - ends[0])
-    uv = ends @ camera.K.T
-    uv = uv[:, :2] / uv[:, 2:]
-    along = image.end - image.start
-    image_length = float(np.linalg.norm(along))
-    along = along / image_length
-    tau = (uv - image.start) @ along
-    covered = np.array([max(0.0, float(tau.min())), min(image_length, float(tau.max()))])
+    rows = np.array(
+        [(i, j) for i, a in enumerate(cloud_lines) for j, b in enumerate(image_lines) if a.label == b.label],
+        dtype=np.int64,
+    ).reshape(-1, 2)
+    if len(rows) == 0:
+        return rows, NO_PAIRS
+    cloud = _seen_parts([cloud_lines[i] for i in rows[:, 0]], camera, T_cam_lidar)
+    image = [image_lines[j] for j in rows[:, 1]]
+    start = np.stack([line.start for line in image])
+    along = np.stack([line.end for line in image]) - start
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = along / length
+    tau = np.einsum("nki,ni->nk", cloud.uv - start[:, None], along)
+    covered = np.column_stack([np.maximum(0.0, tau.min(axis=1)), np.minimum(length[:, 0], tau.max(axis=1))])
     unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
-    common = float(covered[1] - covered[0])
-    if common < max(MIN_OVERLAP_PX * unit, MIN_OVERLAP_SHARE * min(image_length, float(np.ptp(tau)))):
-        return None
-    share = (covered - tau[0]) / (tau[1] - tau[0])
-    z = 1.0 / ((1 - share) / ends[0, 2] + share / ends[1, 2])
-    position = length * (cut[0] + (cut[1] - cut[0]) * share * z / ends[1, 2])
-    middle = 0.5 * length if cloud.mean_m is None else cloud.mean_m
-    arm = position - middle
-    n_cam, _ = plk.plucker(ends[:1], ends[1:])
-    kappa = float(plk.line_sensitivity(n_cam, camera.K)[0])
-    fit = cloud.sigma_m**2 * (1.0 / len(cloud.points) + np.outer(arm, arm) / max(cloud.spread, 1e-9))
-    noise = image.sigma_px**2 * np.eye(2) + kappa**2 * (fit + MODEL_M**2) / np.outer(z, z)
-    seen = image.start + covered[:, None] * along
-    if not math.isfinite(float(noise.sum())):
-        return None
-    return plk.LinePairs(cloud.start[None], cloud.end[None], seen[:1], seen[1:], noise[None])
+    shorter = np.minimum(length[:, 0], np.ptp(tau, axis=1))
+    common = covered[:, 1] - covered[:, 0]
+    enough = cloud.visible & (common >= np.maximum(MIN_OVERLAP_PX * unit, MIN_OVERLAP_SHARE * shorter))
+    share = (covered - tau[:, :1]) / np.where(enough, tau[:, 1] - tau[:, 0], 1.0)[:, None]
+    z = 1.0 / ((1 - share) / cloud.depth[:, :1] + share / cloud.depth[:, 1:])
+    arm = cloud.first[:, None] + cloud.length[:, None] * share * z / cloud.depth[:, 1:]
+    fit = cloud.noise[:, None, None] * (
+        cloud.per_point[:, None, None] + arm[:, :, None] * arm[:, None, :] / cloud.spread[:, None, None]
+    )
+    sigma_px = np.array([line.sigma_px for line in image])
+    noise = sigma_px[:, None, None] ** 2 * np.eye(2) + (cloud.kappa**2)[:, None, None] * (
+        fit + MODEL_M**2
+    ) / (z[:, :, None] * z[:, None, :])
+    enough &= np.isfinite(noise).all(axis=(1, 2))
+    pairs = plk.LinePairs(
+        np.stack([cloud_lines[i].start for i in rows[:, 0]]),
+        np.stack([cloud_lines[i].end for i in rows[:, 0]]),
+        start + covered[:, :1] * along,
+        start + covered[:, 1:] * along,
+        noise,
+    )
+    return rows[enough], plk.select(pairs, enough)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SeenParts:
+    """The parts of cloud lines in front of the camera, as arrays over N lines.
+
+    Attributes:
+        visible: Whether there is such a part.
+        uv: (N,2,2), px of its two ends.
+        depth: (N,2), m, of its ends.
+        first: (N,), m, its first end along the line, from the mean of the line's points.
+        length: (N,), m.
+        kappa: (N,), px, sensitivity of FORMULAS D1.
+        noise: (N,), m^2, sigma_m squared.
+        per_point: (N,), 1/m of D1.
+        spread: (N,), m^2.
+    """
+
+    visible: NDArray[np.bool_]
+    uv: Floats
+    depth: Floats
+    first: Floats
+    length: Floats
+    kappa: Floats
+    noise: Floats
+    per_point: Floats
+    spread: Floats
+
+
+def _seen_parts(lines: Sequence[CloudLine], camera: CameraModel, T_cam_lidar: Floats) -> _SeenParts:
+    ends = np.stack([np.stack([line.start, line.end]) for line in lines]) @ T_cam_lidar[:3, :3].T
+    ends = ends + T_cam_lidar[:3, 3]
+    span = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(span, axis=1)
+    near = ends[:, :, 2] < MIN_DEPTH_M
+    visible = ~near.all(axis=1) & (length > MIN_DEPTH_M / 2)
+    # Share of the way from start to end where the depth limit cuts the line.
+    rise = np.where(near.any(axis=1) & visible, span[:, 2], 1.0)
+    limit = (MIN_DEPTH_M - ends[:, 0, 2]) / rise
+    cut = np.where(near & visible[:, None], limit[:, None], [0.0, 1.0])
+    ends = ends[:, :1] + cut[:, :, None] * span[:, None]
+    depth = np.where(visible[:, None], ends[:, :, 2], 1.0)
+    uv = (ends @ camera.K.T)[:, :, :2] / depth[:, :, None]
+    n_cam = np.cross(ends[:, 0], ends[:, 1])
+    mean = np.array(
+        [
+            0.5 * reach if line.mean_m is None else line.mean_m
+            for line, reach in zip(lines, length, strict=True)
+        ]
+    )
+    return _SeenParts(
+        visible,
+        uv,
+        depth,
+        cut[:, 0] * length - mean,
+        (cut[:, 1] - cut[:, 0]) * length,
+        plk.line_sensitivity(n_cam, camera.K),
+        np.array([line.sigma_m**2 for line in lines]),
+        np.array([1.0 / max(len(line.points), 1) for line in lines]),
+        np.array([max(line.spread, 1e-9) for line in lines]),
+    )

@@ -18,6 +18,10 @@ REFERENCE_FOCAL_PX = 720.0
 """px; lengths below are those of an image with this focal length and grow with it: they are angles."""
 BLUR_PX = 0.8
 """px; takes the staircase from edges without moving them."""
+GRID_PER_UNIT = 0.5
+"""Grid px per px of the reference focal length: the widest poles are some 20 grid px wide."""
+_HALF = 0.5
+"""Share of a coarse px that must be covered."""
 MIN_LENGTH_PX = 25.0
 """px; shorter strokes have no direction: 0.5 px at each end are 1.6 deg."""
 HOUGH_GAP_PX = 6.0
@@ -84,6 +88,7 @@ def find_image_lines(image: CameraImage, masks: Masks, camera: CameraModel) -> l
     unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
     grey = cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY).astype(np.float32)
     grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), BLUR_PX * unit), dtype=np.float32)
+    masks = _coarse(masks, unit)
     lines = []
     for label, mask in _labelled(masks):
         strokes = []
@@ -93,6 +98,22 @@ def find_image_lines(image: CameraImage, masks: Masks, camera: CameraModel) -> l
             strokes += _straight(ideal[np.isfinite(ideal).all(axis=1)], unit)
         lines += [_image_line(label, stroke, unit) for stroke in _merged(strokes, unit)]
     return lines
+
+
+def _coarse(masks: Masks, unit: float) -> Masks:
+    """Masks on a grid no finer than needed: a stroke that is many px wide has no core one px wide."""
+    factor = int(min(masks.scale_x, masks.scale_y) * unit / GRID_PER_UNIT)
+    if factor <= 1:
+        return masks
+    size = (max(1, masks.lane.shape[1] // factor), max(1, masks.lane.shape[0] // factor))
+    lane, pole = (
+        np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        for mask in (masks.lane, masks.pole)
+    )
+    shrink = size[0] / masks.lane.shape[1], size[1] / masks.lane.shape[0]
+    return Masks(
+        lane >= _HALF, pole >= _HALF, lane, pole, masks.scale_x * shrink[0], masks.scale_y * shrink[1]
+    )
 
 
 def _labelled(masks: Masks) -> tuple[tuple[LineLabel, NDArray[np.bool_]], ...]:

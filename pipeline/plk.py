@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import se3
 from pipeline.records import Floats
@@ -20,7 +21,7 @@ STEP_SCALE = np.array([0.01] * 3 + [0.1] * 3)
 """rad and m; makes the steps of the solvers comparable: 1 cm of sight at 1 m, 10 cm at 10 m."""
 
 _MAX_STEPS = 60
-_CONVERGED = 1e-13
+_CONVERGED = 1e-10
 """Step in units of STEP_SCALE below which the solvers stop."""
 
 _MIN_DAMPING = 1e-10
@@ -92,6 +93,17 @@ def stack(parts: Sequence[LinePairs]) -> LinePairs:
         np.concatenate([part.image_start for part in parts]),
         np.concatenate([part.image_end for part in parts]),
         np.concatenate([part.covariance for part in parts]),
+    )
+
+
+def select(pairs: LinePairs, chosen: NDArray[np.bool_]) -> LinePairs:
+    """The pairs for which ``chosen`` (N,) holds."""
+    return LinePairs(
+        pairs.start[chosen],
+        pairs.end[chosen],
+        pairs.image_start[chosen],
+        pairs.image_end[chosen],
+        pairs.covariance[chosen],
     )
 
 

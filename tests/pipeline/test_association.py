@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline import plk, se3
-from pipeline.association import associate, pair_on_overlap
+from pipeline.association import associate, pairs_on_overlap
 from pipeline.records import CloudLine, ImageLine
 
 _spec = importlib.util.spec_from_file_location(
@@ -105,10 +105,10 @@ def test_lines_behind_the_camera_and_outside_the_image_line_give_no_pair():
     behind = CloudLine(
         "lane", cloud[0].start - [40, 0, 0], cloud[0].end - [40, 0, 0], cloud[0].points, 0.03, 9.0
     )
-    assert pair_on_overlap(behind, image[0], scenes.CAMERA, scenes.TRUTH) is None
+    assert len(pairs_on_overlap([behind], image[:1], scenes.CAMERA, scenes.TRUTH)[0]) == 0
     far = np.array([50.0, 0.0, 0.0])
     beyond = CloudLine("lane", cloud[0].start + far, cloud[0].end + far, cloud[0].points, 0.03, 9.0)
-    assert pair_on_overlap(beyond, image[0], scenes.CAMERA, scenes.TRUTH) is None
+    assert len(pairs_on_overlap([beyond], image[:1], scenes.CAMERA, scenes.TRUTH)[0]) == 0
 
 
 def test_a_lane_that_begins_behind_the_camera_is_cut_to_what_it_sees():
@@ -116,7 +116,7 @@ def test_a_lane_that_begins_behind_the_camera_is_cut_to_what_it_sees():
     start, end = np.array([-20.0, 1.8, -scenes.HEIGHT]), np.array([30.0, 1.8, -scenes.HEIGHT])
     cloud = scenes.fitted("lane", start, end, 80, 0.01, rng)
     image = scenes.imaged("lane", np.array([6.5, 1.8, -scenes.HEIGHT]), end, 0.1, rng)
-    pair = pair_on_overlap(cloud, image, scenes.CAMERA, scenes.TRUTH)
+    _, pair = pairs_on_overlap([cloud], [image], scenes.CAMERA, scenes.TRUTH)
     assert np.abs(plk.residuals(pair, scenes.CAMERA.K, scenes.TRUTH)).max() < 3
     assert np.linalg.norm(pair.image_end - pair.image_start) > 0.9 * np.linalg.norm(image.end - image.start)
 
@@ -131,7 +131,7 @@ def test_covariance_of_the_end_distances_is_that_of_repeated_fits(monkeypatch):
     for _ in range(3000):
         cloud = scenes.fitted("lane", start, end, 40, 0.05, rng)
         image = scenes.imaged("lane", start, end, 0.5, rng)
-        pair = pair_on_overlap(cloud, image, scenes.CAMERA, scenes.TRUTH)
+        _, pair = pairs_on_overlap([cloud], [image], scenes.CAMERA, scenes.TRUTH)
         residuals.append(plk.residuals(pair, scenes.CAMERA.K, scenes.TRUTH)[0])
         stated.append(pair.covariance[0])
     measured = np.cov(np.array(residuals).T)

@@ -287,7 +287,7 @@ def rigid(rows: list[list[float]] | None, where: str) -> Floats | None:
     R = T[:3, :3]
     # Products of huge entries overflow; an entry beyond 1 is wrong by itself.
     largest = float(np.abs(R).max())
-    error = largest - 1.0 if largest > 2.0 else float(np.abs(R @ R.T - np.eye(3)).max())
+    error = largest - 1.0 if largest > 1.0 + _ROUNDING else float(np.abs(R @ R.T - np.eye(3)).max())
     if error > _ROUNDING:
         raise RigError(
             f"{where}: the rotation is not orthonormal (off by {error:.2g})",

@@ -1,8 +1,8 @@
 """Sources: where messages come from. Every module here offers ``SOURCE`` (a :class:`SourceKind`).
 
 A source is opened once and iterated once; it yields :class:`~monitor.messages.Message` in the order of log
-time, and :class:`Tick` when nothing came for a period (live sources only). It is a context manager: leaving it
-frees the file.
+time, and :class:`Tick` when nothing came for a period (live sources only). It is a context manager: leaving
+it frees the file.
 """
 
 import importlib

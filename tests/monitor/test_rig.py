@@ -1,7 +1,9 @@
 """Rig files: what is read, what is refused, and in which words."""
 
+import contextlib
 import json
 import math
+import tomllib
 
 import numpy as np
 import pytest
@@ -113,7 +115,7 @@ def test_calib_json_is_a_rig_of_one_pair():
         ({"extrinsic": "file:front"}, r"extrinsic.*store:NAME"),
         ({"extrinsic": {"T_cam_lidar": np.eye(3).tolist()}}, r"T_cam_lidar"),
         ({"extrinsic": {"T_cam_lidar": np.diag([1, 1, -1, 1]).tolist()}}, r"rotation mirrors"),
-        ({"extrinsic": {"T_cam_lidar": np.diag([1, 1, 1.01, 1]).tolist()}}, r"not orthonormal \(off by 0.02"),
+        ({"extrinsic": {"T_cam_lidar": np.diag([1, 1, 1.01, 1]).tolist()}}, r"not orthonormal \(off by 0.01"),
         ({"extrinsic": {"T_cam_lidar": T.T.tolist()}}, r"last row"),
         ({"T_vehicle_lidar": np.diag([2, 1, 1, 1]).tolist()}, r"T_vehicle_lidar: the rotation is not"),
         (
@@ -135,6 +137,39 @@ def test_what_is_wrong_is_refused_by_name(change, words):
 def test_a_misspelt_key_at_the_top():
     with pytest.raises(RigError, match=r"rig.toml: vehical is not a known key.*did you mean 'vehicle'"):
         parse_rig({**document(), "vehical": "v"}, where="rig.toml")
+
+
+leaves = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.sampled_from([0, -1, 1e308, 10**400, "", "store:", "store:a", "a/b", [], {}, [[]], [[1, 2], [3]]]),
+    st.floats(),
+    st.text(max_size=5),
+    st.lists(st.integers(), max_size=4),
+)
+
+
+@given(st.data(), st.sampled_from(["rig", "calib"]))
+def test_any_value_in_any_place_gives_a_rig_or_a_rig_error(data, kind):
+    K = [[50, 0, 32], [0, 50, 24], [0, 0, 1]]
+    camera = {"width": 64, "height": 48, "K": K, "D": [0.1, 0, 0, 0, 0]}
+    if kind == "calib":
+        whole = {
+            "camera": {**camera, "distortion_model": "plumb_bob"},
+            "T_cam_lidar": T.tolist(),
+            "camera_name": "a",
+        }
+    else:
+        whole = tomllib.loads(TOML)
+        whole["pairs"][0]["camera"] |= camera
+    place, key = whole, data.draw(st.sampled_from(sorted(whole)))
+    while isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
+        place = place[key]
+        key = data.draw(st.sampled_from(sorted(place) if isinstance(place, dict) else range(len(place))))
+    place[key] = data.draw(leaves)
+    with contextlib.suppress(RigError):
+        assert parse_rig(whole, where="x").pairs
 
 
 def test_no_pairs_and_repeated_names_are_refused():

@@ -119,25 +119,22 @@ def watch(
     Raises:
         InputError: Not one frame could be used, for a reason that lies in the input.
     """
-    pairs = 0
+    pairs, arrival_ns = 0, 0
     for item in messages:
         if stop.is_set():
             break
-        if isinstance(item, Tick):
-            _tell(
-                watching_.outputs,
-                [event for e in watching_.engines.values() for event in e.tick(item.now_ns)],
-            )
-            continue
-        for pair in watching_.intake.take(item):
+        arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
+        for pair in watching_.intake.take(item) if isinstance(item, Message) else ():
             pairs += 1
-            _tell(watching_.outputs, watching_.engines[pair.pair].step(pair))
+            _tell(watching_.outputs, watching_.engines[pair.pair].step(pair, arrival_ns))
             if progress is not None:
                 progress(pairs)
+        for engine in watching_.engines.values():
+            _tell(watching_.outputs, engine.tick(arrival_ns))
     interrupted = stop.is_set()
     if not interrupted:
         for pair in watching_.intake.flush():
-            _tell(watching_.outputs, watching_.engines[pair.pair].step(pair))
+            _tell(watching_.outputs, watching_.engines[pair.pair].step(pair, arrival_ns))
         _refuse_unusable(watching_, losses)
     for engine in watching_.engines.values():
         _tell(watching_.outputs, engine.finish())

@@ -43,6 +43,7 @@ class Engine:
         self._told: tuple[str, str] | None = None
         self._told_ns: int | None = None
         self._now_ns = 0
+        self._arrival: tuple[int, int] | None = None
         self._used = 0
         self._dropped: Counter[str] = Counter()
         self._timing: dict[str, deque[float]] = {}
@@ -60,9 +61,15 @@ class Engine:
         """Sweeps and images of pairs that gave no evidence, by reason."""
         return self._dropped
 
-    def step(self, pair: FramePair) -> list[Event]:
-        """Takes a pair in: what was seen in it, and the status where one is due."""
+    def step(self, pair: FramePair, arrival_ns: int) -> list[Event]:
+        """Takes a pair in: what was seen in it, and the status where one is due.
+
+        Args:
+            pair: A sweep and its image.
+            arrival_ns: When the message that completed it came, on the clock of the source.
+        """
         self._now_ns = pair.image_stamp_ns
+        self._arrival = (pair.image_stamp_ns, arrival_ns)
         self._cloud_ns.append(pair.cloud_stamp_ns)
         self._image_ns.append(pair.image_stamp_ns)
         with self._stage("frame"):
@@ -75,9 +82,12 @@ class Engine:
         self._used += 2
         return [self._frame_event(pair, findings), *self._due()]
 
-    def tick(self, now_ns: int) -> list[Event]:
-        """Nothing came until ``now_ns``."""
-        self._now_ns = max(self._now_ns, now_ns)
+    def tick(self, arrival_ns: int) -> list[Event]:
+        """No pair came until ``arrival_ns`` of the source's clock: stamps are taken to have run on as long."""
+        if self._arrival is None:
+            self._arrival = (arrival_ns, arrival_ns)
+        data_ns, since_ns = self._arrival
+        self._now_ns = max(self._now_ns, data_ns + max(0, arrival_ns - since_ns))
         self.watch.silent(self._now_ns)
         return self._due()
 

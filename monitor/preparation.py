@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from monitor.discovery import Survey, compose, discover, path, survey_in
+from monitor.discovery import VEHICLE_FRAMES, Survey, compose, discover, path, survey_in
 from monitor.rig import Rig, RigPair, bind, camera_from_info, inject, load_rig, parse_rig
 from monitor.sources import Source, TopicInfo, open_source
 from pipeline.errors import InputError, RigError
@@ -130,9 +130,12 @@ def _completed(pair: RigPair, survey: Survey) -> RigPair:
             )
         model, _ = camera_from_info(survey.infos[info_topic][1], rectified=camera.rectified, topic=image)
         camera = dataclasses.replace(camera, model=model)
-    T = pair.T_cam_lidar
+    T, T_vehicle_lidar = pair.T_cam_lidar, pair.T_vehicle_lidar
+    source = pair.lidar.frame or survey.clouds.get(cloud, "")
+    if T_vehicle_lidar is None:
+        chains = (path(survey.transforms.values(), frame, source) for frame in VEHICLE_FRAMES)
+        T_vehicle_lidar = next((compose(chain) for chain in chains if chain is not None), None)
     if T is None:
-        source = pair.lidar.frame or survey.clouds.get(cloud, "")
         target = camera.frame or (survey.images[image][0] if image in survey.images else "")
         chain = path(survey.transforms.values(), target, source)
         if chain is None:
@@ -142,4 +145,4 @@ def _completed(pair: RigPair, survey: Survey) -> RigPair:
                 hint="give T_cam_lidar in the rig file, or record tf_static",
             )
         T = compose(chain)
-    return dataclasses.replace(pair, camera=camera, T_cam_lidar=T)
+    return dataclasses.replace(pair, camera=camera, T_cam_lidar=T, T_vehicle_lidar=T_vehicle_lidar)

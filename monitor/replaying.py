@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from monitor.bus_replay import OverBus
 from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
 from monitor.model_file import model_bytes
@@ -53,14 +54,17 @@ def replay(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"folder {out} can not be made: {error.strerror}", hint="--out wants a folder") from error
+        raise InputError(
+            f"folder {out} can not be made: {error.strerror}", hint="--out wants a folder"
+        ) from error
     # What an earlier run left there must not pass for this one's.
     (out / FILE_NAME).unlink(missing_ok=True)
     outputs = open_outputs(OUTPUTS, Surroundings(prepared.rig.vehicle, folder=out, images_hz=images_hz))
     try:
         under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
-        with open_source(location) as source:
-            watch(under_watch, source, source.losses, stop, progress)
+        source = open_source(location)
+        with OverBus(source, "replay") if over_zenoh else source as messages:
+            watch(under_watch, messages, messages.losses, stop, progress)
     finally:
         outputs.close()
     return Summary.model_validate_json((out / FILE_NAME).read_bytes())

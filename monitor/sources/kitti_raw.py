@@ -9,6 +9,7 @@ stamps the nominal 10 Hz stand in. KITTI's stamps have no time zone; they are re
 import itertools
 import json
 import re
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -113,15 +114,16 @@ class FolderSource:
     def _read(self, path: Path) -> bytes | None:
         """The bytes of a file; None, and a counted loss, where it can not be read."""
         try:
-            size = path.stat().st_size
-            if size <= LARGEST_FILE:
+            status = path.stat()
+            size = status.st_size
+            if size <= LARGEST_FILE and stat.S_ISREG(status.st_mode):
                 return path.read_bytes()
         except OSError as error:
             self.losses.add("unreadable")
             self.losses.notes.append(f"{path.name} can not be read: {error.strerror}")
             return None
         self.losses.add("too_large")
-        self.losses.notes.append(f"{path.name} has {size} bytes, more than {LARGEST_FILE}")
+        self.losses.notes.append(f"{path.name} is no file of at most {LARGEST_FILE} bytes ({size})")
         return None
 
 

@@ -6,6 +6,7 @@ of log time as far as the order of the chunks allows. Every chunk's CRC is check
 its own messages and no others.
 """
 
+import dataclasses
 import heapq
 import os
 import struct
@@ -238,8 +239,7 @@ class McapFile:
     def _chunk(self, chunk: records.Chunk, offset: int) -> Iterator[tuple[int, list[records.Message]]]:
         """The messages of a chunk, by log time; nothing where its bytes do not fit its CRC."""
         try:
-            _check_size(chunk)
-            inside = breakup_chunk(chunk, validate_crc=True)
+            inside = breakup_chunk(_unpacked(chunk), validate_crc=True)
         except _DAMAGE:
             self._damaged_chunk(offset)
             return
@@ -346,6 +346,8 @@ def starts_with(path: Path, magic: bytes) -> bool:
 def _opened(path: Path) -> IO[bytes]:
     if not path.exists():
         raise InputError(f"{path} does not exist")
+    if not path.is_file():
+        raise InputError(f"{path} is no file")
     try:
         file = path.open("rb")
     except OSError as error:
@@ -377,12 +379,23 @@ def _check_summary(file: IO[bytes], size: int) -> None:
             raise ValueError(crc)
 
 
-def _check_size(chunk: records.Chunk) -> None:
-    """Refuses a chunk whose content would be larger than any real one, before it is unpacked."""
+def _unpacked(chunk: records.Chunk) -> records.Chunk:
+    """The chunk without compression: never more bytes than it declares, and never more than any real one has.
+
+    Raises:
+        ValueError: It declares too much, or holds another number of bytes than it declares.
+    """
     declared = chunk.uncompressed_size
-    if chunk.compression == "zstd":
-        declared = max(declared, zstandard.frame_content_size(chunk.data))
-    elif chunk.compression == "lz4":
-        declared = max(declared, lz4.frame.get_frame_info(chunk.data)["content_size"])
     if declared > _LARGEST_RECORD:
         raise ValueError(declared)
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(chunk.data) > declared:
+            raise ValueError(declared)
+        data = zstandard.decompress(chunk.data, declared)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=declared + 1)
+    else:
+        data = chunk.data
+    if len(data) != declared:
+        raise ValueError(len(data))
+    return dataclasses.replace(chunk, compression="", data=data)

@@ -1,9 +1,12 @@
 """MCAP files against what was written into them: whole, cut anywhere, with any byte flipped."""
 
 import struct
+import tracemalloc
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -41,6 +44,11 @@ def written(path, *, compression=CompressionType.ZSTD, chunked=True, shuffle=Fal
             truth.append(("/a" if i % 2 == 0 else "/b", log_ns, data))
         writer.finish()
     return truth
+
+
+def headless_lz4(data):
+    """LZ4 that does not say how much it holds."""
+    return lz4.frame.compress(data, store_size=False)
 
 
 def read(path):
@@ -182,6 +190,27 @@ def test_a_chunk_that_claims_to_be_huge_is_refused_before_it_is_unpacked(recordi
     (tmp_path / "huge.mcap").write_bytes(raw)
     _, losses = read(tmp_path / "huge.mcap")
     assert losses.counts["damaged_chunk"] == 1
+
+
+@pytest.mark.parametrize(
+    ("compression", "pack"),
+    [("lz4", lz4.frame.compress), ("zstd", zstandard.compress), ("lz4", headless_lz4)],
+)
+@pytest.mark.parametrize("declared", [1000, 1 << 28])
+def test_a_small_chunk_that_unpacks_to_a_huge_one_takes_no_memory(tmp_path, compression, pack, declared):
+    packed = pack(bytes(1 << 27))
+    head = struct.pack("<QQQII", 0, 1, declared, 0, len(compression)) + compression.encode()
+    body = head + struct.pack("<Q", len(packed)) + packed
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(MAGIC + struct.pack("<BQ", 6, len(body)) + body)
+    tracemalloc.start()
+    messages, losses = read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert messages == []
+    assert losses.counts["damaged_chunk"] == 1
+    if declared == 1000:
+        assert peak < 32 << 20
 
 
 def test_a_record_that_claims_to_be_longer_than_the_file_ends_the_reading(tmp_path):

@@ -124,7 +124,9 @@ def test_damage_inside_one_file_of_a_series_is_passed_on(tmp_path):
     (folder / "bag_2.mcap").write_bytes(raw[: len(raw) - 20])
     with open_source(str(folder)) as source:
         assert len(list(source)) == 24
-    assert "bag_2.mcap: 2 messages read; the rest is missing or damaged" in source.losses.notes[0]
+    assert (
+        "bag_2.mcap: 2 messages read; the summary at its end is missing or damaged" in source.losses.notes[0]
+    )
 
 
 def test_a_series_without_any_readable_file(tmp_path):

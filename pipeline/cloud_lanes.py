@@ -226,7 +226,6 @@ def _is_painted(surface: _Surface, stroke: Bools) -> bool:
     if length < MIN_LANE_M or len(metres) < MIN_LANE_METRES or np.ptp(reach) < MIN_RADIAL * length:
         return False
     lit = np.isin(np.floor(along), metres)
-    inside = lit & (np.abs(across) < REFIT_M[-1])
     flanks = [lit & (side * across > FLANK_M[0]) & (side * across < FLANK_M[1]) for side in (-1, 1)]
     # The ground may end beside an edge line: the side that is there must do.
     flanks = [flank for flank in flanks if flank.sum() >= MIN_BACKGROUND]
@@ -234,8 +233,12 @@ def _is_painted(surface: _Surface, stroke: Bools) -> bool:
         return False
     beside = [float(surface.shade[flank].mean()) for flank in flanks]
     both = np.logical_or.reduce(flanks)
+    # Chance is judged over the whole length: the metres of the stroke were chosen for being bright.
+    span = (along >= own.min()) & (along <= own.max())
+    inside = span & (np.abs(across) < REFIT_M[-1])
+    around = span & (np.abs(across) > FLANK_M[0]) & (np.abs(across) < FLANK_M[1])
     # One more than counted: a few dark flank points do not prove that bright ones are rare.
-    rate = (int((both & surface.bright).sum()) + 1) / (int(both.sum()) + 1)
+    rate = (int((around & surface.bright).sum()) + 1) / (int(around.sum()) + 1)
     # Capped per metre, or one bright cover outvotes the metres.
     by_chance = float(pdtrc(float(np.minimum(echoes, METRE_ECHOES).sum()) - 1, rate * float(inside.sum())))
     contrast = float(surface.shade[stroke].mean()) - max(beside)

@@ -1,0 +1,100 @@
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline import se3
+from pipeline.cloud_lanes import find_lanes
+from pipeline.ground import fit_ground
+from pipeline.records import PointCloud
+
+_spec = importlib.util.spec_from_file_location(
+    "line_scenes", Path(__file__).parents[1] / "oracles" / "line_scenes.py"
+)
+scenes = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenes)
+
+
+def found(cloud, rng, up=scenes.UP):
+    return find_lanes(cloud, fit_ground(cloud, up, rng), np.ones(len(cloud), dtype=bool), rng)
+
+
+def off_axis(line, start, end):
+    """Largest distance of the line's ends from the true line, m."""
+    along = (end - start) / np.linalg.norm(end - start)
+    offsets = np.stack([line.start, line.end]) - start
+    return np.linalg.norm(offsets - (offsets @ along)[:, None] * along, axis=1).max()
+
+
+def partner(line, truth):
+    return min(truth, key=lambda ends: off_axis(line, *ends))
+
+
+@pytest.mark.parametrize("dash", [None, (3.0, 6.0)])
+def test_painted_lines_are_found_where_they_are(dash):
+    rng = np.random.default_rng(0)
+    lanes = found(scenes.sampled_cloud(rng, dash=dash), rng)
+    assert len(lanes) == 4
+    assert len({partner(line, scenes.lane_ends())[0][1] for line in lanes}) == 4
+    for line in lanes:
+        assert off_axis(line, *partner(line, scenes.lane_ends())) < 0.06
+        assert line.sigma_m < 0.05
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 10_000))
+def test_turning_the_lidar_turns_the_lines(seed):
+    rng = np.random.default_rng(seed)
+    turn = se3.exp_so3(rng.normal(size=3) * 2)
+    lanes = found(scenes.sampled_cloud(np.random.default_rng(3), turn=turn), rng, turn @ scenes.UP)
+    assert len(lanes) == 4
+    for line in lanes:
+        ends = [(turn @ a, turn @ b) for a, b in scenes.lane_ends()]
+        assert off_axis(line, *partner(line, ends)) < 0.08
+
+
+def test_points_out_of_view_take_no_part():
+    rng = np.random.default_rng(4)
+    cloud = scenes.sampled_cloud(rng)
+    left = cloud.xyz[:, 1] > 0
+    lanes = find_lanes(cloud, fit_ground(cloud, scenes.UP, rng), left, rng)
+    assert len(lanes) == 2
+    assert all(left[line.points].all() for line in lanes)
+
+
+def test_no_intensity_no_lanes():
+    rng = np.random.default_rng(5)
+    assert found(PointCloud(scenes.sampled_cloud(rng).xyz), rng) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bare_road_has_no_lanes(seed):
+    rng = np.random.default_rng(seed)
+    assert found(scenes.sampled_cloud(rng, lanes=[]), rng) == []
+
+
+def test_scale_and_offset_of_intensity_do_not_matter():
+    cloud = scenes.sampled_cloud(np.random.default_rng(6))
+    dimmer = PointCloud(cloud.xyz, (0.2 * cloud.intensity + 0.1).astype(np.float32))
+    first, second = (found(one, np.random.default_rng(7)) for one in (cloud, dimmer))
+    assert [line.points.tolist() for line in first] == [line.points.tolist() for line in second]
+
+
+@pytest.mark.parametrize("thing", ["patch", "verge", "ring", "cover"])
+def test_bright_ground_that_is_no_line(thing):
+    rng = np.random.default_rng(7)
+    cloud = scenes.sampled_cloud(rng, lanes=[], poles=[])
+    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
+    reach = np.hypot(x, y)
+    bright = {
+        "patch": (y > 2.0) & (y < 6.0) & (x > 5),
+        "verge": y > 3.0,
+        # One laser that reads bright: straight over a few degrees of its turn.
+        "ring": np.abs(reach - 12.0) < 0.1,
+        "cover": (np.abs(x - 9) < 0.4) & (np.abs(y - 1) < 0.4),
+    }[thing]
+    intensity = np.where(bright, 0.6, cloud.intensity).astype(np.float32)
+    assert found(PointCloud(cloud.xyz, intensity), rng) == []

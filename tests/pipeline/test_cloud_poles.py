@@ -1,0 +1,95 @@
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import se3
+from pipeline.cloud_poles import find_poles
+from pipeline.ground import fit_ground
+from pipeline.records import PointCloud
+
+_spec = importlib.util.spec_from_file_location(
+    "line_scenes", Path(__file__).parents[1] / "oracles" / "line_scenes.py"
+)
+scenes = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenes)
+
+
+def found(cloud, rng, up=scenes.UP):
+    return find_poles(cloud, fit_ground(cloud, up, rng), np.ones(len(cloud), dtype=bool))
+
+
+def off_axis(line, start, end):
+    """Largest distance of the line's ends from the true line, m."""
+    along = (end - start) / np.linalg.norm(end - start)
+    offsets = np.stack([line.start, line.end]) - start
+    return np.linalg.norm(offsets - (offsets @ along)[:, None] * along, axis=1).max()
+
+
+def partner(line, truth):
+    return min(truth, key=lambda ends: off_axis(line, *ends))
+
+
+def test_poles_are_found_where_they_stand():
+    rng = np.random.default_rng(0)
+    poles = found(scenes.sampled_cloud(rng), rng)
+    assert len(poles) == 4
+    for line in poles:
+        assert off_axis(line, *partner(line, scenes.pole_ends())) < 0.09
+        assert (line.end - line.start) @ scenes.UP > 1.0
+
+
+def test_poles_are_moved_from_their_front_to_their_axis():
+    rng = np.random.default_rng(1)
+    radius = 0.15
+    cloud = scenes.sampled_cloud(rng, poles=[(10.0, 5.0), (12.0, -6.0)], radius=radius, noise=0.005)
+    poles = found(cloud, rng)
+    assert len(poles) == 2
+    for line in poles:
+        (x, y) = min([(10.0, 5.0), (12.0, -6.0)], key=lambda p: abs(p[1] - line.start[1]))
+        sight = np.array([x, y]) / np.hypot(x, y)
+        # Uncorrected the axis would stand pi/4 of the radius, 0.12 m, too near.
+        assert abs((line.start[:2] - [x, y]) @ sight) < 0.03
+
+
+def test_turning_the_lidar_turns_the_poles():
+    rng = np.random.default_rng(2)
+    turn = se3.exp_so3(np.array([0.4, -1.9, 0.8]))
+    poles = found(scenes.sampled_cloud(rng, turn=turn), rng, turn @ scenes.UP)
+    assert len(poles) == 4
+    for line in poles:
+        ends = [(turn @ a, turn @ b) for a, b in scenes.pole_ends()]
+        assert off_axis(line, *partner(line, ends)) < 0.09
+
+
+def test_points_out_of_view_take_no_part():
+    rng = np.random.default_rng(4)
+    cloud = scenes.sampled_cloud(rng)
+    left = cloud.xyz[:, 1] > 0
+    poles = find_poles(cloud, fit_ground(cloud, scenes.UP, rng), left)
+    assert len(poles) == 2
+    assert all(left[line.points].all() for line in poles)
+
+
+def test_a_pole_on_the_border_of_a_cell_is_one_pole():
+    for step in np.linspace(0, 0.5, 6):
+        rng = np.random.default_rng(3)
+        cloud = scenes.sampled_cloud(rng, lanes=[], poles=[(12.0 + step, 5.0 + step)])
+        assert len(found(cloud, rng)) == 1
+
+
+@pytest.mark.parametrize("thing", ["wall", "car", "leaning", "hedge row"])
+def test_upright_things_that_are_no_poles(thing):
+    rng = np.random.default_rng(8)
+    cloud = scenes.sampled_cloud(rng, poles=[])
+    n = 3000
+    z = rng.uniform(-1.7, 1.5, n)
+    shapes = {
+        "wall": np.column_stack([rng.uniform(8, 20, n), np.full(n, 6.0), z]),
+        "car": np.column_stack([rng.uniform(10, 14, n), rng.uniform(4, 5.8, n), z]),
+        "leaning": np.column_stack([12.0 + 0.3 * z, np.full(n, 4.0), z]),
+        "hedge row": np.column_stack([rng.uniform(9, 10.5, n), rng.uniform(4, 4.4, n), z]),
+    }
+    xyz = np.concatenate([cloud.xyz, shapes[thing].astype(np.float32)])
+    assert found(PointCloud(xyz), rng) == []

@@ -1,8 +1,8 @@
 """A file for a library that can not be trusted with a full disk.
 
-The library writes into a pipe, as it believes a file; a thread of ours carries the bytes to the disk. When the
-disk fails, the thread remembers why and goes on emptying the pipe: the library never waits and never fails,
-which matters where its own way of failing is to hang.
+The library writes into a pipe, as it believes a file; a thread of ours carries the bytes to the disk. When
+the disk fails, the thread remembers why and goes on emptying the pipe: the library never waits and never
+fails, which matters where its own way of failing is to hang.
 """
 
 import os

@@ -53,8 +53,8 @@ _CLOSE_TIMEOUT_S = 20.0
 class RerunLog:
     """An open file of rerun. OSError where it can not be opened.
 
-    rerun's own file writer raises nothing when the disk fills up and may hang for ever when it is closed after
-    that: its bytes go through a pipe instead.
+    rerun's own file writer raises nothing when the disk fills up, and may hang for ever when it is closed
+    after that: its bytes go through a pipe instead.
 
     Args:
         path: The file.

@@ -2,9 +2,9 @@
 
 Data go through a bounded queue to a thread of their own: the engine never waits for the disk. A full queue
 drops its oldest event of the kind that comes. A second thread flushes on a timer, so that a kill loses little
-and a full disk is noticed soon: the recording is then lost, which :attr:`Recording.lost` says. Nothing listens
-on the network, and the part of rerun that writes files sends no analytics (its viewer does until ``rerun
-analytics disable`` was run).
+and a full disk is noticed soon: the recording is then lost, which :attr:`Recording.lost` says. Nothing
+listens on the network, and the part of rerun that writes files sends no analytics (its viewer does until
+``rerun analytics disable`` was run).
 """
 
 import threading

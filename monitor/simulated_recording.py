@@ -41,8 +41,8 @@ _IMAGE_DELAY_NS = 12_000_000
 """ns from exposure to the bus: readout and compression."""
 _CLOUD_DELAY_NS = 4_000_000
 """ns from the end of the sweep to the bus."""
-_FRAMES_A_TASK = 8
-"""A task draws the street anew (0.3 s against 0.6 s a frame), and its messages wait in memory (25 MB)."""
+_FRAMES_A_TASK = 12
+"""A task draws the street anew (0.3 s against 0.6 s a frame), and its messages wait in memory (30 MB)."""
 _CHUNK_BYTES = 4 << 20
 
 

@@ -24,8 +24,9 @@ NEXT_STEPS: dict[State, str] = {
     "extrinsic accept`. Until then do not rely on the projection between this LiDAR and this camera.",
     "suspect": "Keep driving: more evidence settles it. If it stays suspect on several drives, inspect the "
     "mount and learn a `calibwatch baseline`, which narrows what can be told.",
-    "unobservable": "No statement is possible from these scenes. Drive where there are poles, kerbs and lane "
-    "markings in good light; `calibwatch inspect` tells whether the inputs are what the rig file says.",
+    "unobservable": "No statement is possible from what was seen. Drive longer, and where there are poles, "
+    "kerbs and lane markings in good light; `calibwatch inspect` tells whether the inputs are those of the rig "
+    "file.",
     "stale": "Pairs of sweep and image stopped coming. Check drivers, cables and clocks; `calibwatch "
     "inspect` lists topics, rates and gaps between the stamps.",
     "fault": "The watch can not work until this is mended: the reason names it. `calibwatch config check` "
@@ -57,7 +58,8 @@ def size_text(axis: AxisName, value: float | None, *, sign: bool = False) -> str
         return "unknown"
     unit = unit_of(axis)
     digits = 2 if unit == "deg" else 3
-    return f"{value:{'+' if sign else ''}.{digits}f} {unit}"
+    rounded = round(value, digits) + 0.0  # no minus before a nought
+    return f"{rounded:{'+' if sign else ''}.{digits}f} {unit}"
 
 
 def axis_text(name: AxisName, axis: AxisDrift) -> str:

@@ -238,7 +238,7 @@ def _tables(status: Status) -> list[dict[str, Any]]:
     dropped = [(f"dropped: {reason}", str(number)) for reason, number in sorted(frames.dropped.items())]
     return [
         {
-            "title": "Frames",
+            "title": "Sweeps and images",
             "rows": [("received", str(frames.received)), ("used", str(frames.used)), *dropped],
         },
         {

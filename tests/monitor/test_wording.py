@@ -134,6 +134,7 @@ def test_sizes_carry_sign_and_unit():
     assert size_text("yaw", 0.5, sign=True) == "+0.50 deg"
     assert size_text("up", -0.0412, sign=True) == "-0.041 m"
     assert size_text("up", 0.2) == "0.200 m"
+    assert size_text("yaw", -0.001, sign=True) == "+0.00 deg"
     assert size_text("up", None) == "unknown"
 
 

@@ -19,7 +19,7 @@ def twist_matrix(omega, velocity):
     return w
 
 
-def street(rng, *, length=120.0, recesses=True):
+def street(rng, *, length=75.0, recesses=True):
     """Boxes (n,2,3) as lowest and highest corner along a road in x: facades, parked cars, posts."""
     boxes = []
     for side in (-1.0, 1.0):
@@ -48,7 +48,7 @@ def sweep(
     start,
     clockwise=True,
     rings=40,
-    columns=720,
+    columns=600,
     period=0.1,
     noise=0.015,
     carried=None,

@@ -91,11 +91,15 @@ def find_image_lines(image: CameraImage, masks: Masks, camera: CameraModel) -> l
     masks = _coarse(masks, unit)
     lines = []
     for label, mask in _labelled(masks):
+        centres = [
+            _centres(grey, label, (start, end), widths, unit)
+            for start, end, widths in _segments(mask, masks, unit)
+        ]
+        # One call for all: the inverse of the lens costs more by call than by point.
+        ideal = ideal_pixels(camera, np.concatenate([np.zeros((0, 2)), *centres]))
         strokes = []
-        for start, end, widths in _segments(mask, masks, unit):
-            centres = _centres(grey, label, (start, end), widths, unit)
-            ideal = ideal_pixels(camera, centres)
-            strokes += _straight(ideal[np.isfinite(ideal).all(axis=1)], unit)
+        for points in np.split(ideal, np.cumsum([len(part) for part in centres])):
+            strokes += _straight(points[np.isfinite(points).all(axis=1)], unit)
         lines += [_image_line(label, stroke, unit) for stroke in _merged(strokes, unit)]
     return lines
 
@@ -231,9 +235,8 @@ def _centres(
         window = np.abs(offset[None, :] - side * 0.5 * width[:, None]) <= margin[:, None]
         # Each side stays on its own half, or both find the same edge of a thin stroke.
         window &= side * offset[None, :] > -0.5 * margin[:, None]
-        signed = -side * slope
-        if label == "pole":
-            signed *= _polarity(signed, window)
+        # Paint is brighter than the road; what stands behind a pole changes along it.
+        signed = np.abs(slope) if label == "pole" else -side * slope
         edges.append(_peak(signed, window, offset, floor))
     left, right = edges
     both = np.isfinite(left) & np.isfinite(right)
@@ -242,12 +245,6 @@ def _centres(
         return np.zeros((0, 2))
     middle = 0.5 * (left[both] + right[both])
     return np.asarray(station[both] + middle[:, None] * normal)
-
-
-def _polarity(signed: Floats, window: NDArray[np.bool_]) -> float:
-    """Whether a pole's edge rises or falls: the sign that most cross-sections agree on."""
-    inside = np.where(window, signed, 0.0)
-    return 1.0 if np.median(inside.max(axis=1) + inside.min(axis=1)) >= 0 else -1.0
 
 
 def _peak(signed: Floats, window: NDArray[np.bool_], offset: Floats, floor: Floats) -> Floats:
@@ -317,6 +314,12 @@ def _merged(strokes: list[_Stroke], unit: float) -> list[_Stroke]:
 
 def _joint(first: _Stroke, second: _Stroke, unit: float) -> _Stroke | None:
     """Both strokes as one, where one straight line explains them as well as each is explained alone."""
+    along, across = (second.mean - first.mean) @ np.column_stack(
+        [first.direction, [-first.direction[1], first.direction[0]]]
+    )
+    # Spares the fit where the other lies well off this line's continuation.
+    if abs(across) > 4.0 * FLOOR_PX * unit + 0.1 * abs(along):
+        return None
     points = np.concatenate([first.points, second.points])
     mean = points.mean(axis=0)
     direction = np.linalg.svd(points - mean, full_matrices=False)[2][0]

@@ -68,6 +68,16 @@ def test_pole_before_a_background_of_two_shades_is_found_by_both_edges():
     assert np.abs(distances(line, (199.5, 20.0), (199.5, 280.0))).max() < 0.2
 
 
+def test_pole_whose_background_changes_along_it_is_found_in_one():
+    image, masks = scenes.draw([("pole", (200.0, 20.0), (203.0, 280.0), 8.0)], grey=(90, 140))
+    pixels = image.pixels.astype(int)
+    # Sky above, darker than the pole below.
+    pixels[:140][pixels[:140] < 100] = 230
+    (line,) = find_image_lines(CameraImage(pixels.astype(np.uint8)), masks, CAMERA)
+    assert np.abs(distances(line, (200.0, 20.0), (203.0, 280.0))).max() < 0.3
+    assert np.linalg.norm(line.end - line.start) > 230
+
+
 def test_dashes_of_one_line_become_one_line():
     start, end = np.array([100.0, 310.0]), np.array([400.0, 140.0])
     parts = [(0.0, 0.3), (0.5, 0.7), (0.85, 1.0)]

@@ -1,7 +1,10 @@
 import importlib.util
+import json
 import math
+import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +18,7 @@ from pipeline.line_witness import (
     solve_lines,
 )
 from pipeline.observability import in_vehicle_axes, observable
-from pipeline.records import CameraImage, PointCloud
+from pipeline.records import CameraImage, CameraModel, Masks, PointCloud
 
 _spec = importlib.util.spec_from_file_location(
     "line_scenes", Path(__file__).parents[1] / "oracles" / "line_scenes.py"
@@ -242,3 +245,53 @@ def test_black_image_and_no_masks_are_ordinary():
     )
     assert found.image_lines == ()
     assert solve_lines([found], scenes.CAMERA, scenes.TRUTH).estimate.features == 0
+
+
+RECORDINGS = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+
+
+def bright_strokes(pixels):
+    """Lane mask without a network: below the horizon, brighter than both sides."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 1.0)
+    beside = cv2.blur(grey, (14, 1))
+    mask = np.minimum(grey - np.roll(beside, 14, 1), grey - np.roll(beside, -14, 1)) > 20
+    mask[:200] = False
+    count, label, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    long = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) > 30
+    return (long & (np.arange(count) > 0))[label]
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(("name", "tolerance"), [("000005", 0.15), ("000009", 0.45)])
+@pytest.mark.parametrize("yaw_deg", [0.0, -0.7])
+def test_lanes_of_one_real_frame_give_pitch_and_yaw(name, tolerance, yaw_deg):
+    """The published extrinsic is good to 0.1 to 0.2 deg; 000009 is one bent road."""
+    folder = RECORDINGS / "kitti_singles" / name
+    if not folder.is_dir():
+        pytest.skip(f"no recordings in {RECORDINGS}")
+    calib = json.loads((folder / "calib.json").read_text())
+    truth = np.array(calib["T_cam_lidar"])
+    truth[:3, :3] = se3.orthonormalised(truth[:3, :3])
+    pixels = cv2.imread(str(folder / "image.png"))
+    height, width = pixels.shape[:2]
+    camera = CameraModel("pinhole", np.array(calib["camera"]["K"]).reshape(3, 3), np.zeros(0), width, height)
+    raw = np.fromfile(folder / "cloud.bin", np.float32).reshape(-1, 4)
+    lane, none = bright_strokes(pixels), np.zeros((height, width), dtype=bool)
+    masks = Masks(lane, none, lane.astype(np.float32), none.astype(np.float32), 1.0, 1.0)
+    injected = np.array([0, 0, np.radians(yaw_deg), 0, 0, 0])
+    stored = se3.stored_before(truth, injected, None)
+    found = find_lines(
+        PointCloud(raw[:, :3].copy(), raw[:, 3].copy()),
+        CameraImage(pixels),
+        masks,
+        camera,
+        stored,
+        up=-stored[1, :3],
+        forward=stored[2, :3],
+        rng=np.random.default_rng(0),
+    )
+    solution = solve_lines([found], camera, stored)
+    drift, seen = in_axes(solution.estimate)
+    assert seen.axis_observed.tolist()[1:4] == [True, True, False]
+    assert abs(np.degrees(drift - injected)[1:3]).max() < tolerance
+    assert (np.abs(drift - injected)[seen.axis_observed] < 3 * seen.axis_sigmas[seen.axis_observed]).all()

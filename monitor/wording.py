@@ -25,8 +25,8 @@ NEXT_STEPS: dict[State, str] = {
     "suspect": "Keep driving: more evidence settles it. If it stays suspect on several drives, inspect the "
     "mount and learn a `calibwatch baseline`, which narrows what can be told.",
     "unobservable": "No statement is possible from what was seen. Drive longer, and where there are poles, "
-    "kerbs and lane markings in good light; `calibwatch inspect` tells whether the inputs are those of the rig "
-    "file.",
+    "kerbs and lane markings in good light; `calibwatch inspect` tells whether the inputs are those of the "
+    "rig file.",
     "stale": "Pairs of sweep and image stopped coming. Check drivers, cables and clocks; `calibwatch "
     "inspect` lists topics, rates and gaps between the stamps.",
     "fault": "The watch can not work until this is mended: the reason names it. `calibwatch config check` "

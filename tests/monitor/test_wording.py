@@ -126,7 +126,7 @@ def test_within_the_limits_the_axes_that_surely_moved_are_named():
 
 
 def test_an_axis_that_is_held_is_never_said_to_have_moved():
-    axes = {"yaw": HELD | {"value": 3.0}, "up": {"value": 0.1, "sigma": 0.01}}
+    axes = {"yaw": HELD | {"value": 3.0, "sigma": 2.0}, "up": {"value": 0.1, "sigma": 0.01}}
     assert moved_axes(status("drifted", axes)) == ("up",)
 
 

@@ -117,6 +117,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, small_files):
     with small_files(10), pytest.raises(OSError, match="too large"):
         write_whole(path, b"second, longer than ten bytes")
     assert path.read_bytes() == b"first"
+    assert [file.name for file in tmp_path.iterdir()] == ["x.json"]
     write_whole(path, b"third")
     assert path.read_bytes() == b"third"
     assert [file.name for file in tmp_path.iterdir()] == ["x.json"]

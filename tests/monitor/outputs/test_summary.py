@@ -60,6 +60,13 @@ def test_a_new_reason_within_a_state_is_a_change_at_its_own_stamp(tmp_path, driv
     ]
 
 
+def test_a_state_counts_from_the_stamp_at_which_it_was_entered(tmp_path, drive):
+    # Statuses that came between were lost: the first that tells of the state is younger than it.
+    run = [StatusEvent(drive().status(5)), StatusEvent(drive().status(40))]
+    timeline = summed(tmp_path, run)["pairs"]["front"]["timeline"]
+    assert [change["stamp_ns"] for change in timeline] == [drive().stamp(3), drive().stamp(30)]
+
+
 def test_an_interrupted_run_says_so(tmp_path, drive):
     end = EndEvent(complete=False, note="interrupted by the user", warnings=("12 messages were refused",))
     summary = summed(tmp_path, [StatusEvent(drive().status(5))], end=end)

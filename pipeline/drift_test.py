@@ -1,8 +1,8 @@
-"""Is the stored extrinsic still true? Joint test of six axes, protection levels, what would have been noticed.
+"""Is the stored extrinsic still true? Joint test of six axes, protection levels, smallest noticed drift.
 
-Three kinds of error are kept apart (FORMULAS F, DESIGN 4): the random error of the window (its covariance), the
-systematic floor between scenes (measured on drives of one calibration, PROBE 3), and the stored extrinsic's own
-uncertainty. The last one widens the claim 'it moved', not the protection level.
+Three kinds of error are kept apart (FORMULAS F, DESIGN 4): the random error of the window (its covariance),
+the systematic floor between scenes (measured on drives of one calibration, PROBE 3), and the stored
+extrinsic's own uncertainty. The last one widens the claim 'it moved', not the protection level.
 """
 
 import math
@@ -19,22 +19,23 @@ class DriftTestParameters:
     """Thresholds of the test, each from a stated risk.
 
     Attributes:
-        alarm: Joint statistic above which a window alone says 'moved': chi-square of 6 degrees of freedom at 1e-4.
+        alarm: Joint statistic above which a window alone says 'moved': chi-square, 6 degrees of freedom, at
+            1e-4.
         suspicion: The same at 1e-3: more evidence is wanted.
-        noncentrality: Squared drift in sigma that exceeds ``alarm`` with probability 0.99 (6 degrees of freedom).
-        least_loss: Share of the best score that must be lost when the stored extrinsic may only move inside the
-            floor: half as much again as the largest of 300 healthy windows on four drives (PROBE 5).
+        noncentrality: Squared drift in sigma that exceeds ``alarm`` with probability 0.99 (6 dof).
+        least_loss: Share of the best score that must be lost when the stored extrinsic may only move inside
+            the floor: half as much again as the largest of 300 healthy windows on four drives (PROBE 5).
         suspicious_loss: Loss that is suspicious whatever the joint statistic says.
-        least_contrast: Score at the estimate over chance, minus 1, below which image and cloud show nothing in
-            common: three frames with nothing to say lay below 0.09, all others above 0.25 (PROBE 9).
+        least_contrast: Score at the estimate over chance, minus 1, below which image and cloud show nothing
+            in common: three frames with nothing to say lay below 0.09, all others above 0.25 (PROBE 9).
         K_fa: Two-sided quantile of a false alarm of 1e-5 per axis (FORMULAS F5).
         K_md: One-sided quantile of a missed drift of 1e-3 (FORMULAS F5).
         most_sigma: An axis is observable while its sigma is at most so many alert limits (DESIGN 4).
         floor_roll: Systematic floor of roll between scenes, rad.
         floor_bearing: Floor of the bearing up and down, and across, at ``bearing_range``, rad: what is sure.
         floor_m: Floor of forward, left, up, m.
-        lines_floor_rad: Systematic floor of what lines say of one angle, rad: the middle of a mask is no more the
-            middle of the paint than a few px, and lanes leave roll to the far end of a dash.
+        lines_floor_rad: Systematic floor of what lines say of one angle, rad: the middle of a mask is no more
+            the middle of the paint than a few px, and lanes leave roll to the far end of a dash.
         lines_floor_m: The same of one shift, m.
         bearing_range: Range at which pitch and up, yaw and left make one bearing, m (PROBE 3).
         bound_rad: Bound of the systematic error of one angle between scenes, rad.

@@ -1,8 +1,9 @@
 """The second witness: how well the edges of the cloud lie on gradients of the image (PROBE sections 1, 4, 5).
 
-The score of an extrinsic is the weighted mean gradient response under all projected edges of a window of frames. The
-estimate is its maximum near the stored extrinsic; its covariance is the sandwich H^-1 G H^-1, where everything that
-falls into one cell of the image over the whole window counts as ONE observation: the same car is one witness.
+The score of an extrinsic is the weighted mean gradient response under all projected edges of a window of
+frames. The estimate is its maximum near the stored extrinsic; its covariance is the sandwich H^-1 G H^-1,
+where everything that falls into one cell of the image over the whole window counts as ONE observation: the
+same car is one witness.
 """
 
 import dataclasses
@@ -19,7 +20,7 @@ from pipeline.gradients import GradientPyramid, sample
 from pipeline.records import CameraModel, Floats
 
 UNITS = np.array([math.radians(0.25)] * 3 + [0.05] * 3)
-"""Alert units in which steps are measured (0.25 deg, 5 cm): a unit of each matters about as much to perception."""
+"""Alert units in which steps are measured (0.25 deg, 5 cm): each matters about as much to perception."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,14 +28,14 @@ class EdgeWitnessParameters:
     """How the maximum is sought and how sure it is.
 
     Attributes:
-        step_limits: Longest step at each level of the pyramid, alert units: what the blur of that level can bridge.
+        step_limits: Longest step at each level of the pyramid, alert units: what its blur can bridge.
         most_steps: Steps per level.
-        least_step: Search ends when a step is shorter, alert units: 0.003 deg, a tenth of the smallest sigma seen.
+        least_step: Search ends when a step is shorter, alert units: 0.003 deg, a tenth of the least sigma.
         difference: Step of the differences that give the Hessian, alert units.
         eigenvalue_floor: Smallest eigenvalue of the Hessian as a share of the largest.
-        sigma_factor: Scatter of window estimates over their stated sigma on four measured drives (PROBE 4): k.
-        least_gain: A maximum reached over a coarser level must score so much more to be preferred, share: coarse
-            levels lead into false modes, which score up to 3 % more; real drifts gain over 12 %.
+        sigma_factor: Scatter of window estimates over their stated sigma on four drives (PROBE 4): k.
+        least_gain: A maximum reached over a coarser level must score so much more to be preferred, share:
+            coarse levels lead into false modes, which score up to 3 % more; real drifts gain over 12 %.
         farthest_rad: A maximum further from the stored extrinsic is not believed.
         farthest_m: Likewise.
         contrast_starts: Random extrinsics that tell the score of chance.
@@ -139,10 +140,10 @@ class EdgeSolution:
         score: Score at the maximum.
         score_stored: Score at the stored extrinsic.
         contrast: Score at the stored extrinsic over that of chance, minus 1.
-        loss: Share of the best score that is lost if the stored extrinsic may move inside the floor only (G of
-            PROBE 5).
-        block_gains: For each third of the window in time, its own score at the maximum over that at the best point
-            inside the floor, minus 1.
+        loss: Share of the best score that is lost if the stored extrinsic may move inside the floor only (G
+            of PROBE 5).
+        block_gains: For each third of the window in time, its own score at the maximum over that at the best
+            point inside the floor, minus 1.
         edges: Number of edges.
         frames: Number of frames.
     """
@@ -162,8 +163,8 @@ def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Flo
     """Score of an extrinsic, its gradient by xi, and each edge's share of that gradient.
 
     Returns:
-        Score (weighted mean response), gradient float64 (6,) by (phi, rho) at ``T_cam_lidar``, and float64 (N,6)
-        whose sum is the gradient. The direction across each edge is held while differentiating.
+        Score (weighted mean response), gradient float64 (6,) by (phi, rho) at ``T_cam_lidar``, and float64
+        (N,6) whose sum is the gradient. The direction across each edge is held while differentiating.
     """
     value, point_slope, points = _respond(batch, T_cam_lidar, level)
     total = float(batch.weight.sum())
@@ -179,7 +180,7 @@ def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Flo
 
 
 def _respond(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[Floats, Floats, Floats]:
-    """Response (N,) under each edge, its derivative (N,3) by the point, and the points (N,3), camera frame."""
+    """Response (N,) under each edge, its derivative (N,3) by the point, the points (N,3), camera frame."""
     R = T_cam_lidar[:3, :3]
     points = batch.position @ R.T + T_cam_lidar[:3, 3]
     uv, valid = cameras.project_unbounded(batch.camera, points)
@@ -213,8 +214,8 @@ def solve(
     Args:
         batch: Edges and gradients of the window's frames.
         T_stored: The stored extrinsic.
-        floor: float64 (6,6), covariance of xi that is no drift: systematic floor and the stored extrinsic's own
-            uncertainty, camera axes.
+        floor: float64 (6,6), covariance of xi that is no drift: systematic floor and the stored extrinsic's
+            own uncertainty, camera axes.
         parameters: See there.
         rng: Draws the extrinsics of chance.
     """
@@ -307,7 +308,7 @@ def _ascend(
 
 
 def _start_curvature(share: Floats, weight: Floats, value: float) -> Floats:
-    """First guess of the curvature from the outer product of the edges' gradients (PROBE 1): 4/s sum w g g^T / sum w."""
+    """First guess of the curvature from the edges' gradients g (PROBE 1): 4/s sum w g g^T / sum w."""
     total = float(weight.sum())
     per_edge = share * (total / np.maximum(weight, 1e-12))[:, None]
     outer = (per_edge * (weight / total)[:, None]).T @ per_edge
@@ -345,7 +346,7 @@ def _descend(
 
 
 _ACCEPT, _SHRINK = 1e-4, 0.25
-"""Shares of the predicted decrease: below the first a step is not taken, below the second the next is shorter."""
+"""Shares of the predicted decrease: below the first no step is taken, below the second it is halved."""
 
 
 def _trust_region_step(B: Floats, gradient: Floats, radius: float) -> Floats:
@@ -373,7 +374,7 @@ _PENALTY = 0.004
 def _best_inside(
     batch: EdgeBatch, T_stored: Floats, best: float, floor: Floats, parameters: EdgeWitnessParameters
 ) -> Floats:
-    """The best xi when leaving the stored extrinsic costs by the floor: what may be explained without a drift."""
+    """The best xi when leaving the stored extrinsic costs by the floor: what needs no drift to explain it."""
     inverse = np.linalg.inv(floor)
     scale = 1.0 / max(best, 1e-9)
 

@@ -1,7 +1,7 @@
 """Edges of a cloud that an image shows too: jumps of range, and paint on the road (PROBE section 1).
 
-Each edge is a point on the border as the camera sees it, with the direction across the border. Sizes that depend on
-the sensor (steps along and between rings, noise of the intensity) come from the cloud itself.
+Each edge is a point on the border as the camera sees it, with the direction across the border. Sizes that
+depend on the sensor (steps along and between rings, noise of the intensity) come from the cloud itself.
 """
 
 import math
@@ -40,8 +40,8 @@ class EdgeParameters:
         jump_up_share: The same as a share: the road itself recedes from ring to ring.
         above_ground_m: The nearer point of a jump to the ring above stands at least so high, m.
         gap_steps: A gap along the ring of more azimuth steps breaks it: what lies there was not seen.
-        inset: How far an edge lies from the nearer point towards the farther ray, in steps: between the two, a
-            little on the side of the body, for a beam that grazes it still returns.
+        inset: How far an edge lies from the nearer point towards the farther ray, in steps: between the two,
+            a little on the side of the body, for a beam that grazes it still returns.
         weights: Weight of each kind: between rings the edge is known to half a ring's gap only.
         most: Edges kept per frame.
         margin_px: Edges so far outside the image are kept: a wrong extrinsic may move them in.
@@ -272,7 +272,7 @@ def _paint(
         if strip is None:
             continue
         last_end = strip[1]
-        borders.extend((np.array([p, where]) for where in strip[2:]))
+        borders.extend(np.array([p, where]) for where in strip[2:])
     if not borders:
         return np.zeros((0, 3)), np.zeros((0, 3))
     table = np.array(borders)
@@ -286,7 +286,7 @@ def _paint(
 def _strip(
     along: Floats, intensity: Floats, p: int, start: int, end: int, least: float, parameters: EdgeParameters
 ) -> tuple[int, int, float, float] | None:
-    """The strip around a peak: first and last index of its half level, and its two borders as fractional indices."""
+    """The strip around a peak: ends of its half level, and its two borders as fractional indices."""
     reach = parameters.strip_widest_m + parameters.background_m
     a = max(start, int(np.searchsorted(along, along[p] - reach)))
     b = min(end, int(np.searchsorted(along, along[p] + reach)))
@@ -322,9 +322,8 @@ def _strip(
         np.interp(border_right, np.arange(len(where)), where)
         - np.interp(border_left, np.arange(len(where)), where)
     )
-    if span < parameters.strip_narrowest_m:
-        return None
-    return a + i, a + j, a + border_left, a + border_right
+    wide = span >= parameters.strip_narrowest_m
+    return (a + i, a + j, a + border_left, a + border_right) if wide else None
 
 
 def _crossing(values: Floats, i: int, j: int, level: float) -> float:
@@ -359,7 +358,7 @@ def _thinned(
 
 
 def _capped(group: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Indices of at most ``most`` members, the cap per group as high as that allows, evenly spread inside each."""
+    """Indices of at most ``most`` members, the cap per group as high as can be, evenly spread in each."""
     if len(group) <= most:
         return np.arange(len(group))
     counts = np.bincount(group)

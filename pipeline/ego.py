@@ -1,7 +1,7 @@
 """The ego motion of the LiDAR, tracked from sweep to sweep, and sweeps straightened by it (FORMULAS G3).
 
-A cloud with times per point is straightened by them. One without is straightened by its azimuths where the sense of
-rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise.
+A cloud with times per point is straightened by them. One without is straightened by its azimuths where the
+sense of rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise.
 """
 
 from dataclasses import dataclass
@@ -12,13 +12,12 @@ from pipeline.deskew import Spin, SpinSense, Twist, deskew, sweep_times
 from pipeline.motion import (
     Motion,
     SpinEvidence,
-    Surfels,
     estimate_twist,
     spin_evidence,
     spin_sense,
-    surfels,
 )
 from pipeline.records import Floats, FramePair, PointCloud
+from pipeline.surfels import Surfels, surfels
 
 _NS = 1e9
 
@@ -137,8 +136,8 @@ class Ego:
     def _times(self, pair: FramePair) -> np.ndarray | None:
         """When each point was measured; by azimuth a turn begins straight behind the camera.
 
-        Cameras beside spinning LiDARs are triggered, or chosen, when the beams look their way, in the middle of
-        the turn whose stamp the pair carries.
+        Cameras beside spinning LiDARs are triggered, or chosen, when the beams look their way, in the middle
+        of the turn whose stamp the pair carries.
         """
         if pair.cloud.time is not None:
             return pair.cloud.time

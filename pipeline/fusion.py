@@ -53,7 +53,8 @@ def intersected(a: Testimony, b: Testimony) -> Testimony:
     w = float(_WEIGHTS[int(np.argmax(volumes))])
     information = w * a.information + (1.0 - w) * b.information
     pull = w * a.information @ a.drift + (1.0 - w) * b.information @ b.drift
-    return Testimony(np.linalg.solve(information + prior, pull), information)
+    drift = np.asarray(np.linalg.solve(information + prior, pull), dtype=np.float64)
+    return Testimony(drift, information)
 
 
 def with_floor(testimony: Testimony, floor: Floats) -> Testimony:

@@ -1,7 +1,8 @@
 """Oriented, saturated image gradients at several scales: what the edges of the cloud are compared with.
 
-A gradient is divided by its neighbourhood's mean, so that a dark street counts like a sunny one, and saturated, so
-that one strong border does not outvote the rest. All widths are angles: they follow the focal length.
+A gradient is divided by its neighbourhood's mean, so that a dark street counts like a sunny one, and
+saturated, so that one strong border does not outvote the rest. All widths are angles: they follow the focal
+length.
 """
 
 import math
@@ -52,8 +53,8 @@ class GradientPyramid:
     """Oriented gradients of one image.
 
     Attributes:
-        levels: For each level uint16 (4,h,w): response to a step along 0, 45, 90, 135 degrees (u right, v down),
-            in units of 1/COUNTS.
+        levels: For each level uint16 (4,h,w): response to a step along 0, 45, 90, 135 degrees (u right, v
+            down), in units of 1/COUNTS.
         scales: For each level (sx, sy): level px = (image px + 0.5) * s - 0.5.
     """
 
@@ -79,15 +80,17 @@ def gradient_pyramid(image: CameraImage, camera: CameraModel) -> GradientPyramid
         h, w = response[0].shape[:2]
         scales.append((w / width, h / height))
         half = (max(2, w // 2), max(2, h // 2))
-        response = [cv2.resize(r, half, interpolation=cv2.INTER_AREA) for r in response]
+        response = [
+            np.asarray(cv2.resize(r, half, interpolation=cv2.INTER_AREA), dtype=np.float32) for r in response
+        ]
     return GradientPyramid(tuple(levels), tuple(scales))
 
 
 def _responses(grey: NDArray[np.float32], unit: float) -> list[NDArray[np.float32]]:
     """Saturated squared directional gradients, four float32 (h,w) in 0..1.5."""
     smooth = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX * unit)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1.0 / 8.0)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1.0 / 8.0)
+    gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1.0 / 8.0), dtype=np.float32)
+    gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1.0 / 8.0), dtype=np.float32)
     box = max(3, round(_NEIGHBOURHOOD_PX * unit))
     norm = cv2.blur(cv2.magnitude(gx, gy), (box, box)) + np.float32(_NOISE_FLOOR)
     gx /= norm
@@ -113,8 +116,8 @@ def sample(
         scale: (sx, sy) of the level.
 
     Returns:
-        Response (N,), and its derivative by image px (N,2), with the orientation held; outside the image the border's
-        value and derivative 0.
+        Response (N,), and its derivative by image px (N,2), with the orientation held; outside the image the
+        border's value and derivative 0.
     """
     h, w = stack.shape[2:]
     x = (uv[:, 0] + 0.5) * scale[0] - 0.5

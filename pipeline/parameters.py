@@ -18,8 +18,8 @@ class Parameters:
         edges: What counts as an edge of the cloud.
         edge_witness: How edges are compared with the image.
         masks: How the network's probabilities become masks.
-        lines_every_ns: Time between frames that get masks and lines: the network takes 0.1 s of two cores, and
-            lines of neighbouring frames are the same lines.
+        lines_every_ns: Time between frames that get masks and lines: the network takes 0.1 s of two cores,
+            and lines of neighbouring frames are the same lines.
         window: Which frames stay, and when they are judged.
         test: Thresholds of the drift test.
         verdict: Hysteresis and patience.

@@ -1,12 +1,14 @@
-"""Every value that passes between stages. Arrays are read-only views; a value never changes after it was made.
+"""Every value that passes between stages. Arrays are read-only views; a value never changes once made.
 
 Conventions, fixed here for the whole project:
 - Pixel centres lie at integer coordinates; u to the right, v down.
-- Camera optical frame: x right, y down, z forward. LiDAR points stay in the frame of their message, whatever its axes.
+- Camera optical frame: x right, y down, z forward. LiDAR points stay in the frame of their message, whatever
+  its axes.
 - ``T_cam_lidar`` maps LiDAR points into the camera frame: ``p_C = R p_L + t``.
 - A perturbation ``xi = (phi, rho)`` acts from the left in camera axes: ``R <- Exp(phi) R``,
   ``t <- Exp(phi) t + rho`` (FORMULAS A2).
-- Vehicle axes: x forward, y left, z up; six-vectors for people are ordered roll, pitch, yaw, forward, left, up.
+- Vehicle axes: x forward, y left, z up; six-vectors for people are ordered roll, pitch, yaw, forward, left,
+  up.
 - Metres, radians, seconds; stamps are integer nanoseconds of the data's own clock.
 """
 
@@ -23,7 +25,7 @@ _T = TypeVar("_T", bound=np.generic)
 LineLabel: TypeAlias = Literal["lane", "pole", "structure"]
 
 AXES = ("roll", "pitch", "yaw", "forward", "left", "up")
-"""Names and order of the six axes in which drift is told (radians for the first three, metres for the rest)."""
+"""Names and order of the six axes in which drift is told (the first three in radians, the rest in metres)."""
 
 
 def read_only(array: NDArray[_T]) -> NDArray[_T]:
@@ -250,7 +252,8 @@ class WitnessEstimate:
     Attributes:
         witness: "lines" or "edges".
         xi: float64 (6,), (phi, rho) against the stored extrinsic, camera axes, rad and m.
-        information: float64 (6,6), inverse covariance of xi, symmetric and semidefinite (singular where held).
+        information: float64 (6,6), inverse covariance of xi, symmetric and semidefinite (singular where
+            held).
         frames: Number of frames that took part.
         features: Number of lines or edges that took part.
         chi2: Residual statistic per degree of freedom (1 where the noise model fits).

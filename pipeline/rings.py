@@ -1,9 +1,10 @@
-"""The scan pattern of a spinning LiDAR, found in its own data: rings, order along them, steps between neighbours.
+"""The scan pattern of a spinning LiDAR, found in its own data: rings, order along them, steps.
 
-Nothing is set per sensor. A ring number in the cloud is used where there is one; else rings are read off the order of
-the points (ring after ring) or off their elevation. A cloud without any such pattern gives None.
+Nothing is set per sensor. A ring number in the cloud is used where there is one; else rings are read off the
+order of the points (ring after ring) or off their elevation. A cloud without any such pattern gives None.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -21,6 +22,12 @@ _RING_STRAYS = 0.05
 
 _OWN_SHARE = 0.05
 """Median distance of a point from its ring's elevation, as a share of the sensor's vertical field of view."""
+
+_LEAST_STEP_RAD = 1e-6
+"""Points nearer to each other on a ring are echoes of one beam, and no step."""
+
+_STEP_NOISE_RAD = 1e-3
+"""So far azimuth may run back along a ring: rounding of coordinates to millimetres at 1 m."""
 
 _LEVEL_SHARE = 0.03
 """Share of the range by which neighbours on one surface differ at most."""
@@ -55,8 +62,8 @@ class ScanPattern:
 def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | None:
     """Orders the points that ``keep`` (N,) marks; None where the cloud shows no rings.
 
-    The sensor is taken to stand at the origin of the cloud's frame and to spin about its z axis; a cloud in another
-    frame is turned and moved before (the ring number and the order of points do not mind).
+    The sensor is taken to stand at the origin of the cloud's frame and to spin about its z axis; a cloud in
+    another frame is turned and moved before (the ring number and the order of points do not mind).
     """
     ring = _rings(cloud)
     if ring is None:
@@ -75,7 +82,7 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
     order = np.lexsort((azimuth, rank))
     rank, azimuth = rank[order], azimuth[order]
     step = np.diff(azimuth)[np.diff(rank) == 0]
-    step = step[step > 1e-6]
+    step = step[step > _LEAST_STEP_RAD]
     medians = _medians(elevation[order], rank)
     spacing = np.diff(medians)
     if step.size == 0 or spacing.size == 0:
@@ -114,7 +121,7 @@ def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDA
     sense = math.copysign(1.0, float(np.median(step)))
     step = step * sense
     # Ring after ring means small steps forward nearly always; column after column does not.
-    if float(np.mean((step > -1e-3) & (step < math.radians(5.0)))) < 1.0 - _RING_STRAYS:
+    if float(np.mean((step > -_STEP_NOISE_RAD) & (step < math.radians(5.0)))) < 1.0 - _RING_STRAYS:
         return None
     backward = step < -math.radians(20.0)
     travelled = np.concatenate([[0.0], np.cumsum(np.where(backward, 0.0, step))])
@@ -125,16 +132,16 @@ def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDA
     turns = (travelled + azimuth[0] * sense - seam) / (2.0 * math.pi)
     ring = np.floor(turns).astype(np.int64) + np.concatenate([[0], np.cumsum(backward)])
     ring -= ring[0]
-    # Where a ring ends and the next begins a point's ring is not sure, and no edge may be seen between the two.
+    # Where a ring ends a point's ring is not sure, and no edge may be seen between it and the next.
     unsure = np.abs(turns - np.rint(turns)) * 2.0 * math.pi < 2.0 * float(np.median(step))
     return np.where(unsure, -1, ring)
 
 
 def _seam(azimuth: Floats, elevation: Floats, distance: Floats) -> float:
-    """Azimuth in 0..2 pi at which one ring ends and the next begins: there the elevation jumps, turn after turn.
+    """Azimuth in 0..2 pi at which one ring ends and the next begins: the elevation jumps there every turn.
 
-    Inside a ring it jumps only where the range does (lasers sit some centimetres apart) and comes back, so steps
-    of range are left out and the rest is summed with its sign.
+    Inside a ring it jumps only where the range does (lasers sit some centimetres apart) and comes back, so
+    steps of range are left out and the rest is summed with its sign.
     """
     change = np.diff(elevation)
     turns = max(1.0, float(np.sum(np.abs(np.diff(azimuth)) > math.pi)))
@@ -166,7 +173,8 @@ def _rings_by_elevation(elevation: Floats) -> NDArray[np.int64] | None:
 def _believable(ring: NDArray[np.int64], elevation: Floats) -> bool:
     """Whether the points of a ring keep to its elevation better than to those of other rings.
 
-    Judged by the median point: lasers sit some centimetres apart, which bends a ring by degrees on near objects.
+    Judged by the median point: lasers sit some centimetres apart, which bends a ring by degrees on near
+    objects.
     """
     sure = ring >= 0
     ring, elevation = ring[sure], elevation[sure]
@@ -181,13 +189,11 @@ def _medians(values: Floats, group: NDArray[np.int64], count: int | None = None)
     """Median of ``values`` for each group number; ``group`` is sorted. NaN for a number that is absent."""
     size = int(group[-1]) + 1 if count is None else count
     starts = np.searchsorted(group, np.arange(size + 1))
-    return np.array(
-        [np.median(values[a:b]) if b > a else np.nan for a, b in zip(starts[:-1], starts[1:], strict=True)]
-    )
+    return np.array([np.median(values[a:b]) if b > a else np.nan for a, b in itertools.pairwise(starts)])
 
 
 def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> NDArray[np.int64]:
-    """Ring numbers replaced by their rank from the lowest to the highest ring, whatever the sensor's own order."""
+    """Ring numbers replaced by their rank from the lowest ring up, whatever the sensor's own order."""
     names, inverse = np.unique(ring, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     medians = _medians(elevation[order], inverse[order], len(names))

@@ -1,4 +1,4 @@
-"""The state machine: (memory, judgement, now) -> memory (DESIGN 4). Stamps are the data's; no clock in here."""
+"""The state machine: (memory, judgement, now) -> memory (DESIGN 4). Stamps are the data's; no clock here."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -36,8 +36,8 @@ class VerdictParameters:
     Attributes:
         confirmations: Alarming judgements in a row, with estimates that agree, before 'drifted'.
         agreement_sigma: Estimates agree when they differ by at most so many sigma on every axis.
-        patience_ns: A required axis may go unmonitored so long before 'unobservable' (DESIGN 10: a first verdict
-            takes at most 10 s).
+        patience_ns: A required axis may go unmonitored so long before 'unobservable' (DESIGN 10: a first
+            verdict takes at most 10 s).
         silence_ns: No pair for so long is 'stale' (DESIGN 4).
     """
 
@@ -208,7 +208,7 @@ def acknowledge(memory: Memory, now_ns: int) -> Memory:
 
 
 def finish(memory: Memory, judgement: Judgement | None, frames: int, required: tuple[str, ...]) -> Memory:
-    """The state at the end of a recording: one that is still starting says why it can say nothing (DESIGN 4)."""
+    """The state at the end of a recording: one still starting says why it can say nothing (DESIGN 4)."""
     if memory.state != "starting":
         return memory
     now_ns = memory.input_ns

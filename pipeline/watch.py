@@ -76,7 +76,7 @@ class Mount:
     spin: SpinSense | None = None
 
     @property
-    def R_vehicle_cam(self) -> Floats:
+    def R_vehicle_cam(self) -> Floats:  # noqa: N802 - the name of the rotation
         """Turns camera axes into vehicle axes, (3,3)."""
         return se3.vehicle_axes(self.T_cam_lidar, self.T_vehicle_lidar)
 
@@ -375,7 +375,7 @@ class Watch:
 
 
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:
-    """xi and its information in camera axes -> drift in vehicle axes (FORMULAS A4; B is orthogonal)."""
+    """Drift in vehicle axes from xi and its information in camera axes (FORMULAS A4; B is orthogonal)."""
     return Testimony(B @ xi, B @ information @ B.T)
 
 

@@ -1,4 +1,4 @@
-"""Which frames stay in the rolling window: the newest ones densely, older ones thinned, a bounded number in all."""
+"""Which frames stay in the rolling window: the newest densely, older ones thinned, a bounded number."""
 
 from dataclasses import dataclass
 

@@ -23,13 +23,15 @@ from monitor import bus
 from monitor.bus_samples import Subscription, encoding_of
 from monitor.messages import Message
 from monitor.sources import Losses, Source, Tick, TopicInfo
-from monitor.sources.zenoh_live import ZenohLive
+from monitor.sources.zenoh_live import JOIN_S, ZenohLive
 from pipeline.errors import CalibwatchError, TransportError
 
 WINDOW = 8
 """Messages in flight: half of what a ring (RING) or a topic of the inbox (INBOX) holds."""
 READER_S = 10.0
 """s; how long a writer waits for a reader, and a reader for its acknowledgement to count."""
+_ROUTE_S = 0.01
+"""s; how often a writer looks whether its session knows the reader's subscription."""
 _END_TYPE = "calibwatch.replay-end/1"
 _END_ENCODING = f"application/json;{_END_TYPE}"
 
@@ -71,6 +73,7 @@ class ReplayWriter:
         self._condition = threading.Condition()
         self._acknowledged = 0
         self._reading = False
+        self._pause = threading.Event()
 
     def publish(self, source: Source) -> int:
         """Publishes a source from start to end; gives the number of messages.
@@ -83,11 +86,18 @@ class ReplayWriter:
         with ExitStack() as stack:
             liveliness = self._session.liveliness()
             stack.callback(liveliness.declare_token(f"{self._prefix}/writer").undeclare)
-            acks = self._session.declare_subscriber(f"{self._prefix}/ack", self._on_ack)
-            stack.callback(acks.undeclare)
-            readers = liveliness.declare_subscriber(f"{self._prefix}/reader", self._on_reader, history=True)
-            stack.callback(readers.undeclare)
+            acks = self._session.declare_subscriber(f"{self._prefix}/ack", _ring())
+            self._follow(stack, acks, self._on_ack)
+            readers = liveliness.declare_subscriber(f"{self._prefix}/reader", _ring(), history=True)
+            self._follow(stack, readers, self._on_reader)
             self._await(lambda: self._reading, f"nobody reads {self._prefix}")
+            ending = self._session.declare_publisher(
+                f"{self._prefix}/feed/end",
+                encoding=_END_ENCODING,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+            stack.callback(ending.undeclare)
+            self._await_route(ending)
             for message in source:
                 if self._stop.is_set():
                     return sent
@@ -99,14 +109,10 @@ class ReplayWriter:
                     start = self._await_time(message.log_ns, start, self._pace)
                 self._put(message)
                 sent += 1
-            self._await_credit(sent)
+            if self._pace is None:
+                self._await_credit(sent)
             end = {"messages": sent, "counts": source.losses.counts, "notes": source.losses.notes}
-            self._session.put(
-                f"{self._prefix}/feed/end",
-                json.dumps(end),
-                encoding=_END_ENCODING,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
+            ending.put(json.dumps(end))
             self._await(
                 lambda: self._acknowledged > sent or not self._reading,
                 f"{self._prefix} was not read to its end",
@@ -124,6 +130,37 @@ class ReplayWriter:
             encoding=encoding_of(message),
             attachment=origin.to_bytes(),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+        )
+
+    def _follow(
+        self,
+        stack: ExitStack,
+        samples: "zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]",
+        take: Callable[[zenoh.Sample], None],
+    ) -> None:
+        """Hands samples to ``take`` in a thread of our own, which ends with the stack.
+
+        Callbacks of zenoh run in threads that may outlive the session and abort the interpreter at its exit.
+        """
+
+        def run() -> None:
+            for sample in samples:
+                take(sample)
+
+        thread = threading.Thread(target=run, name=f"zenoh {samples.key_expr}", daemon=True)
+        thread.start()
+        stack.callback(thread.join, JOIN_S)
+        stack.callback(samples.undeclare)
+
+    def _await_route(self, ending: zenoh.Publisher) -> None:
+        """Until this session knows the reader's subscription: its token may be known a moment earlier."""
+        for _ in range(round(READER_S / _ROUTE_S)):
+            status = ending.matching_status
+            if status.matching or self._stop.is_set():  # type: ignore[attr-defined]  # the stub says bool
+                return
+            self._pause.wait(_ROUTE_S)
+        raise TransportError(
+            f"the reader of {self._prefix} has no subscription", hint="start the reader first"
         )
 
     def _await_credit(self, sent: int) -> None:
@@ -202,6 +239,8 @@ class ReplayReader:
                         f"the replay ended after {consumed} messages, before its recording did",
                         hint="the replaying side was stopped or lost the bus",
                     )
+                # An acknowledgement may have come before the writer's subscription was known here.
+                self._acknowledge(consumed)
                 continue
             if item.type == _END_TYPE:
                 self._end(item, consumed)
@@ -248,6 +287,11 @@ class ReplayReader:
         self.losses.notes += notes
         if sent != consumed:
             self.losses.notes.append(f"{consumed} of {sent} replayed messages came over the bus")
+
+
+def _ring() -> "zenoh.handlers.RingChannel[zenoh.Sample]":
+    """The newest samples; acknowledgements and tokens are worth only their latest state."""
+    return zenoh.handlers.RingChannel(4)
 
 
 class OverBus:

@@ -186,6 +186,22 @@ def test_a_reader_that_goes_away_is_noticed(sessions):
     assert "went away" in failures[0]
 
 
+def test_a_paced_replay_ends_although_the_reader_lost_messages(sessions):
+    class Forgetful(ReplayWriter):
+        def _put(self, message):
+            if message.log_ns == 1000:
+                super()._put(message)
+
+    pace = Pace(factor=1e9, monotonic_s=lambda: 0.0)
+    writer = Forgetful(sessions[0], "run", stop=Recorded(), pace=pace)
+    with ReplayReader(sessions[1], "run", stop=threading.Event()) as reader:
+        thread = threading.Thread(target=writer.publish, args=(Recording(50),))
+        thread.start()
+        assert len(list(reader)) == 1
+    thread.join()
+    assert "1 of 50 replayed messages came over the bus" in reader.losses.notes
+
+
 class Recorded(threading.Event):
     """An event that notes how long it was asked to wait, and does not wait."""
 

@@ -247,7 +247,6 @@ def _pair(pair: RigPair, how: str, seen: Mapping[str, _Seen], topics: Sequence[T
     same = by_name[camera].type.startswith("file/") and sorted(images.stamps) == sorted(sweeps.stamps)
     gaps = _gaps(pair, sweeps, images, middle)
     nearest = _nearest_ms([stamp + middle for stamp in sweeps.stamps], images.stamps)
-    delays = (by_name[camera].delay_ms, by_name[lidar].delay_ms)
     in_view = _in_view(pair, sweeps)
     T_lidar_cam = inverse(pair.T_cam_lidar)
     return PairReport(
@@ -265,7 +264,7 @@ def _pair(pair: RigPair, how: str, seen: Mapping[str, _Seen], topics: Sequence[T
         same_stamps=same,
         gap_ms=statistics.median(gaps) if gaps and not same else None,
         nearest_ms=nearest,
-        clock_offset_ms=None if delays[0] is None or delays[1] is None else delays[1] - delays[0],
+        clock_offset_ms=_clock_offset_ms(by_name[lidar], by_name[camera]),
         in_view=in_view,
         problems=tuple(_problems(pair, by_name, len(gaps), nearest, in_view)),
     )
@@ -287,6 +286,19 @@ def _gaps(pair: RigPair, sweeps: _Seen, images: _Seen, middle: int) -> list[floa
             paired += pairer.push_camera(stamp, None, sequence)
     paired += pairer.flush()
     return [(one.camera_ns - one.lidar_ns) / 1e6 for one in paired]
+
+
+def _clock_offset_ms(lidar: TopicReport, camera: TopicReport) -> float | None:
+    """How far the camera's clock is ahead of the LiDAR's if both take equally long from measuring to log.
+
+    A sweep is sent when it ends, which its stamp does not tell where its duration is unknown.
+    """
+    if lidar.delay_ms is None or camera.delay_ms is None or lidar.cloud is None:
+        return None
+    cloud = lidar.cloud
+    known = cloud.middle_ms is not None and cloud.sweep_s is not None
+    end_ms = (cloud.middle_ms or 0.0) + 500.0 * (cloud.sweep_s or 0.0) if known else 0.0
+    return lidar.delay_ms - end_ms - camera.delay_ms
 
 
 def _nearest_ms(sweeps: Sequence[int], images: Sequence[int]) -> float | None:

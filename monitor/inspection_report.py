@@ -96,7 +96,7 @@ class PairReport(_Part):
     )
     nearest_ms: float | None = Field(description="the same over every image and the sweep nearest to it")
     clock_offset_ms: float | None = Field(
-        description="camera stamps against LiDAR stamps of the same moment of arrival; null: no log times"
+        description="camera clock ahead of LiDAR clock by log times, transport included; null: no log times"
     )
     in_view: tuple[int, int] | None = Field(description="points of the first sweep inside the image, of all")
     problems: tuple[str, ...] = Field(description="what will keep it from being judged, one sentence each")

@@ -114,7 +114,9 @@ def _pair(pair: "PairReport", lidar: "TopicReport") -> Iterator[str]:
     sweeps, images = _number(pair.sweeps, "sweep"), _number(pair.images, "image")
     yield f"    {_number(pair.pairs, 'pair')} of {sweeps} and {images}{_gap(pair, lidar)}"
     if pair.clock_offset_ms is not None:
-        yield f"    camera stamps lie {pair.clock_offset_ms:+.1f} ms from LiDAR stamps that arrive with them"
+        side = "ahead of" if pair.clock_offset_ms >= 0 else "behind"
+        offset = f"{abs(pair.clock_offset_ms):.1f} ms {side}"
+        yield f"    camera clock {offset} the LiDAR's by log times, transport included"
     if pair.in_view is not None:
         yield f"    {pair.in_view[0]} of {pair.in_view[1]} points of the first sweep fall into the image"
     for problem in pair.problems:

@@ -33,6 +33,8 @@ FLOOR_SIGMA = np.array([np.radians(0.1)] * 3 + [0.03] * 3)
 """rad and m; lines are matched again at least this wide: what the noise model does not know of."""
 ROUNDS = 3
 """Matching and solving in turn; the pairs no longer change after the second on simulated streets."""
+MIN_FREEDOM = 0.5
+"""Distances measured beyond those that the answer needs; without any a wrong pair looks like drift."""
 FRAME_CORRELATION = 0.5
 """Correlation of the errors of neighbouring frames (FORMULAS F1): 10 frames of a street are worth some 4."""
 VIEW_MARGIN = 0.1
@@ -144,7 +146,8 @@ def solve_lines(frames: Sequence[LineFrame], camera: CameraModel, T_stored: Floa
     Matching and solving take turns, from the prior around the stored extrinsic to the posterior of the
     solution. The prior keeps unobserved directions in place while solving; its pull is taken out of the
     answer again, linearised at the solution. The same pole in 20 frames is not 20 poles: the information is
-    that of ``effective_frames`` frames, divided by chi2 where the residuals are larger than their model.
+    that of ``effective_frames`` frames, divided by chi2 where the residuals are larger than their model, and by
+    a little more where chi2 itself rests on few lines.
 
     Args:
         frames: Lines of each frame.
@@ -152,7 +155,8 @@ def solve_lines(frames: Sequence[LineFrame], camera: CameraModel, T_stored: Floa
         T_stored: float64 (4,4), the stored extrinsic.
 
     Returns:
-        The estimate and the pairs; nothing matched gives no information and no features.
+        The estimate and the pairs; nothing matched, or no pair more than needed to check the others, gives no
+        information and no features.
     """
     prior = plk.Prior(T_stored, np.diag(PRIOR_SIGMA**-2.0))
     T, covariance = T_stored, np.diag(PRIOR_SIGMA**2)
@@ -165,7 +169,7 @@ def solve_lines(frames: Sequence[LineFrame], camera: CameraModel, T_stored: Floa
         solution = plk.method_one(pairs, camera.K, T, prior=prior)
         result = LineSolution(_estimate(solution, found, T_stored), tuple(part.matches for part in found))
         T = solution.T_cam_lidar
-        worth = _worth(found, solution.chi2)
+        worth = _worth(found, solution)
         covariance = np.linalg.inv(worth * solution.information + prior.precision) + np.diag(FLOOR_SIGMA**2)
     return result
 
@@ -176,10 +180,15 @@ def effective_frames(count: int) -> float:
     return count / (1.0 + 2.0 * float(((1.0 - lag / count) * FRAME_CORRELATION**lag).sum()))
 
 
-def _worth(found: Sequence[Association], chi2: float) -> float:
-    """Factor on the information: effective over counted frames, over the misfit."""
+def _worth(found: Sequence[Association], solution: plk.Solution) -> float:
+    """Factor on the information: effective over counted frames, over the misfit and the doubt about it.
+
+    A misfit judged by n degrees of freedom is itself known to sqrt(2 / n) only: the answer's tails are those
+    of Student's t, whose variance is larger by 1 + 2 / n to first order.
+    """
     count = sum(1 for part in found if part.matches)
-    return effective_frames(count) / count / max(1.0, chi2)
+    doubt = 1.0 + 2.0 / max(solution.freedom, MIN_FREEDOM)
+    return effective_frames(count) / count / max(1.0, solution.chi2) / doubt
 
 
 def _nothing() -> WitnessEstimate:
@@ -189,9 +198,11 @@ def _nothing() -> WitnessEstimate:
 def _estimate(solution: plk.Solution, found: Sequence[Association], T_stored: Floats) -> WitnessEstimate:
     """The lines' own answer: prior taken out, directions held that they do not know (FORMULAS D3)."""
     scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
-    worth = _worth(found, solution.chi2)
+    worth = _worth(found, solution)
     values, V = np.linalg.eigh(worth * solution.information * scale)
     known = values >= HELD_SIGMAS**-2.0
+    if solution.freedom < MIN_FREEDOM or not known.any():
+        return _nothing()
     values, V = values[known], V[:, known]
     xi_map = se3.local(T_stored, solution.T_cam_lidar)
     pull = worth * (solution.information @ xi_map + solution.gradient) * PRIOR_SIGMA

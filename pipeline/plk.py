@@ -27,6 +27,12 @@ _CONVERGED = 1e-10
 _MIN_DAMPING = 1e-10
 """Relative to the largest curvature: keeps null directions where they are, slows no observed one."""
 
+_NULL = 1e-9
+"""Curvature over the largest below which a direction is not seen at all (FORMULAS D3)."""
+
+_NO_FREEDOM = 1e-6
+"""Degrees of freedom; what is left by rounding."""
+
 _MAX_DAMPING = 1e6
 """Likewise: a step so small that does not lower the cost is rounding."""
 
@@ -75,6 +81,7 @@ class Solution:
         information: float64 (6,6), of (phi, rho) at the solution, from the lines alone (FORMULAS D2).
         gradient: float64 (6,), of the lines alone at the solution, -sum J^T S^-1 r; zero without a prior.
         distances: float64 (N,), whitened distance of each line.
+        freedom: Measured distances less the freedoms that they, not the prior, decided.
         chi2: Squared whitened distances, Huber weighted, per degree of freedom; 1 where none is to spare.
     """
 
@@ -82,6 +89,7 @@ class Solution:
     information: Floats
     gradient: Floats
     distances: Floats
+    freedom: float
     chi2: float
 
 
@@ -304,6 +312,10 @@ def method_one(
     T = se3.transform(se3.orthonormalised(T[:3, :3]), T[:3, 3])
     lines = at[0]
     loss = np.minimum(lines.distances, HUBER) * lines.distances
-    freedom = 2 * len(pairs) - 6
-    chi2 = float(loss.sum() / freedom) if freedom > 0 else 1.0
-    return Solution(T, lines.information, lines.gradient, lines.distances, chi2)
+    scale = np.outer(STEP_SCALE, STEP_SCALE)
+    decided = np.trace(
+        np.linalg.pinv(at[2] * scale, rcond=_NULL, hermitian=True) @ (lines.information * scale)
+    )
+    freedom = 2 * len(pairs) - float(decided)
+    chi2 = float(loss.sum()) / freedom if freedom > _NO_FREEDOM else 1.0
+    return Solution(T, lines.information, lines.gradient, lines.distances, freedom, chi2)

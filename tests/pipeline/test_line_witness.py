@@ -114,6 +114,17 @@ def test_nothing_matched_is_no_information(kind):
     assert np.array_equal(estimate.xi, np.zeros(6))
 
 
+def test_two_lanes_can_not_check_each_other_and_three_can():
+    rng = np.random.default_rng(13)
+    for count, speaks in ((1, False), (2, False), (3, True)):
+        solution = solve_lines(
+            [frame(rng, lanes=scenes.LANES[:count], poles=[])], scenes.CAMERA, scenes.TRUTH
+        )
+        assert len(solution.matches[0]) == count
+        assert (solution.estimate.features == count) is speaks
+        assert solution.estimate.information.any() == speaks
+
+
 def test_a_frame_without_lines_changes_nothing():
     rng = np.random.default_rng(6)
     frames = [frame(rng) for _ in range(3)]

@@ -28,6 +28,8 @@ class DriftTestParameters:
         suspicious_loss: Loss that is suspicious whatever the joint statistic says.
         least_contrast: Score at the estimate over chance, minus 1, below which image and cloud show nothing
             in common: three frames with nothing to say lay below 0.09, all others above 0.25 (PROBE 9).
+        least_peak: Height of the maximum over chance, in sigma of the score at random extrinsics, below which it
+            may be chance: the highest of a thousand independent places exceeds 3.7 sigma in one case of ten.
         K_fa: Two-sided quantile of a false alarm of 1e-5 per axis (FORMULAS F5).
         K_md: One-sided quantile of a missed drift of 1e-3 (FORMULAS F5).
         most_sigma: An axis is observable while its sigma is at most so many alert limits (DESIGN 4).
@@ -48,6 +50,7 @@ class DriftTestParameters:
     least_loss: float = 0.03
     suspicious_loss: float = 0.10
     least_contrast: float = 0.15
+    least_peak: float = 3.7
     K_fa: float = 4.417
     K_md: float = 3.090
     most_sigma: float = 2.0
@@ -87,6 +90,7 @@ class Evidence:
         covariance: float64 (6,6), of its random error.
         loss: Share of the best score lost when only the floor may explain it (0 where no score exists).
         contrast: Score at the estimate over chance, minus 1.
+        peak: Height of that score over chance, in sigma (inf where no score exists).
         persistent: Whether each part of the window by itself prefers the estimate.
         frames: Frames in the window.
         contradicted: Whether the two witnesses differ by more than their errors allow.
@@ -96,6 +100,7 @@ class Evidence:
     covariance: Floats
     loss: float
     contrast: float
+    peak: float
     persistent: bool
     frames: int
     contradicted: bool = False
@@ -166,7 +171,7 @@ def judge(evidence: Evidence, C_ref: Floats, limits: Floats, parameters: DriftTe
     statistic = float(evidence.drift @ P_inverse @ evidence.drift)
     bound = parameters.bound()
     protection = (parameters.K_fa + parameters.K_md) * sigma + bound
-    seen = evidence.contrast >= parameters.least_contrast
+    seen = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
     convincing = evidence.loss > parameters.least_loss and evidence.persistent and seen
     return Judgement(
         drift=evidence.drift,

@@ -53,7 +53,7 @@ class EdgeWitnessParameters:
     least_gain: float = 0.02
     farthest_rad: float = math.radians(5.0)
     farthest_m: float = 1.0
-    contrast_starts: int = 24
+    contrast_starts: int = 48
     contrast_rad: tuple[float, float] = (math.radians(3.0), math.radians(6.0))
     contrast_m: float = 0.3
     most_edges: int = 10_000
@@ -139,7 +139,8 @@ class EdgeSolution:
         covariance: float64 (6,6) of xi: the sandwich times sigma_factor^2.
         score: Score at the maximum.
         score_stored: Score at the stored extrinsic.
-        contrast: Score at the stored extrinsic over that of chance, minus 1.
+        contrast: Score at the maximum over that of chance, minus 1.
+        peak: Height of the maximum over chance, in standard deviations of the score at random extrinsics.
         loss: Share of the best score that is lost if the stored extrinsic may move inside the floor only (G
             of PROBE 5).
         block_gains: For each third of the window in time, its own score at the maximum over that at the best
@@ -153,6 +154,7 @@ class EdgeSolution:
     score: float
     score_stored: float
     contrast: float
+    peak: float
     loss: float
     block_gains: tuple[float, ...]
     edges: int
@@ -222,6 +224,7 @@ def solve(
     stored = score(batch, T_stored, 0)[0]
     xi, best = _best_maximum(batch, T_stored, stored, parameters)
     T_best = se3.retract(T_stored, xi)
+    chance, spread = _chance(batch, T_stored, parameters, rng)
     inside = _best_inside(batch, T_stored, best, floor, parameters)
     at_best = score_only(batch, T_best, 0)
     at_inside = score_only(batch, se3.retract(T_stored, inside), 0)
@@ -231,7 +234,8 @@ def solve(
         covariance=_covariance(batch, T_best, parameters),
         score=best,
         score_stored=stored,
-        contrast=_contrast(batch, T_stored, stored, parameters, rng),
+        contrast=best / chance - 1.0 if chance > 0 else 0.0,
+        peak=(best - chance) / spread if spread > 0 else 0.0,
         loss=max(0.0, 1.0 - float(at_inside.sum() / at_best.sum()) + penalty) if best > 0 else 0.0,
         block_gains=_block_gains(batch.slot, at_best, at_inside),
         edges=len(batch),
@@ -417,25 +421,17 @@ def _covariance(batch: EdgeBatch, T: Floats, parameters: EdgeWitnessParameters) 
     return np.asarray(UNITS[:, None] * C * UNITS[None, :], dtype=np.float64)
 
 
-def _contrast(
-    batch: EdgeBatch,
-    T_stored: Floats,
-    stored: float,
-    parameters: EdgeWitnessParameters,
-    rng: np.random.Generator,
-) -> float:
-    """Score at the stored extrinsic over the mean at far random ones, minus 1."""
+def _chance(
+    batch: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParameters, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Mean and standard deviation of the score at far random extrinsics."""
     batch = batch.thinned(_COARSE_STRIDE)
-    chance = []
+    scores = []
     for _ in range(parameters.contrast_starts):
         axis, shift = rng.normal(size=3), rng.normal(size=3)
         angle = rng.uniform(*parameters.contrast_rad)
-        xi = np.concatenate(
-            [
-                axis / np.linalg.norm(axis) * angle,
-                shift / np.linalg.norm(shift) * parameters.contrast_m,
-            ]
-        )
-        chance.append(float(score_only(batch, se3.retract(T_stored, xi), 0).sum()))
-    mean = float(np.mean(chance)) / float(batch.weight.sum())
-    return stored / mean - 1.0 if mean > 0 else 0.0
+        turn = axis / np.linalg.norm(axis) * angle
+        xi = np.concatenate([turn, shift / np.linalg.norm(shift) * parameters.contrast_m])
+        scores.append(float(score_only(batch, se3.retract(T_stored, xi), 0).sum()))
+    weight = float(batch.weight.sum())
+    return float(np.mean(scores)) / weight, float(np.std(scores)) / weight

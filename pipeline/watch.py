@@ -341,7 +341,8 @@ class Watch:
             drift=se3.mount_drift(mount.T_cam_lidar, T_estimated, R_vc),
             covariance=fused.covariance(),
             loss=np.inf if edges is None else edges.loss,
-            contrast=np.inf if edges is None else _contrast_at_estimate(edges),
+            contrast=np.inf if edges is None else edges.contrast,
+            peak=np.inf if edges is None else edges.peak,
             persistent=edges is None or min(edges.block_gains, default=0.0) > 0.0,
             frames=len(self._edge_frames),
             contradicted=contradicted,
@@ -377,10 +378,3 @@ class Watch:
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:
     """Drift in vehicle axes from xi and its information in camera axes (FORMULAS A4; B is orthogonal)."""
     return Testimony(B @ xi, B @ information @ B.T)
-
-
-def _contrast_at_estimate(edges: EdgeSolution) -> float:
-    """Score at the estimate over chance, minus 1."""
-    if edges.score_stored <= 0:
-        return 0.0
-    return (1.0 + edges.contrast) * edges.score / edges.score_stored - 1.0

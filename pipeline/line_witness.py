@@ -146,7 +146,7 @@ def solve_lines(frames: Sequence[LineFrame], camera: CameraModel, T_stored: Floa
     Matching and solving take turns, from the prior around the stored extrinsic to the posterior of the
     solution. The prior keeps unobserved directions in place while solving; its pull is taken out of the
     answer again, linearised at the solution. The same pole in 20 frames is not 20 poles: the information is
-    that of ``effective_frames`` frames, divided by chi2 where the residuals are larger than their model, and by
+    that of ``effective_frames`` frames, divided by chi2 where residuals exceed their model, and by
     a little more where chi2 itself rests on few lines.
 
     Args:

@@ -6,6 +6,7 @@ first sweeps and images decoded. Nothing is guessed: what was not looked at, or 
 
 import itertools
 import statistics
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,23 +40,37 @@ _SWEEPS = 5
 """Sweeps per topic that are decoded: enough to tell a constant number of points from a changing one."""
 _TRANSFORMS = 1000
 """tf messages that are decoded for the list of transforms: ten seconds at the usual 100 Hz."""
+_NONE = -1
+"""Stands for an absent number in arrays: hours of a fast topic must fit into memory."""
 _LIVE = "zenoh_live"
 """The kind of source that never ends."""
 
 
 @dataclass(slots=True)
 class _Seen:
-    """What was seen of one topic: (stamp or None, log time, sequence number) of each message."""
+    """What was seen of one topic; the three arrays have one number per message, -1 where there is none."""
 
-    arrivals: list[tuple[int | None, int, int | None]] = field(default_factory=list)
+    headers: "array[int]" = field(default_factory=lambda: array("q"))
+    logged: "array[int]" = field(default_factory=lambda: array("q"))
+    sequences: "array[int]" = field(default_factory=lambda: array("q"))
     clouds: list[tuple[int, PointCloud, float | None]] = field(default_factory=list)
     frame: str = ""
     undecodable: str | None = None
 
+    def arrive(self, message: Message) -> None:
+        """Takes note of a message; what is beyond 64 bits is no stamp."""
+        for numbers, value in (
+            (self.headers, header_stamp_ns(message)),
+            (self.logged, message.log_ns),
+            (self.sequences, message.sequence),
+        ):
+            numbers.append(value if value is not None and 0 <= value < 1 << 63 else _NONE)
+
     @property
     def stamps(self) -> list[int]:
         """Stamps as pairing sees them: of the header, else of the log."""
-        return [log_ns if stamp is None or stamp == 0 else stamp for stamp, log_ns, _ in self.arrivals]
+        both = zip(self.headers, self.logged, strict=True)
+        return [log_ns if stamp in (0, _NONE) else stamp for stamp, log_ns in both]
 
 
 def inspect(location: str, rig_file: Path | None) -> Inspection:
@@ -122,7 +137,7 @@ def _read_through(source: Source) -> tuple[dict[str, _Seen], Survey]:
         if isinstance(message, Tick):
             continue
         topic = seen.setdefault(message.topic, _Seen())
-        topic.arrivals.append((header_stamp_ns(message), message.log_ns, message.sequence))
+        topic.arrive(message)
         if is_cloud(message.type) and len(topic.clouds) < _SWEEPS and topic.undecodable is None:
             _decode_cloud(message, topic)
         if message.type in TF_TYPES and left > 0:
@@ -144,15 +159,15 @@ def _decode_cloud(message: Message, topic: _Seen) -> None:
 
 
 def _topic(topic: TopicInfo, seen: _Seen, survey: Survey, rig: Rig | None) -> TopicReport:
-    headers = [stamp for stamp, _, _ in seen.arrivals if stamp is not None]
-    logged = [log_ns for _, log_ns, _ in seen.arrivals]
-    delays = [log_ns - stamp for stamp, log_ns, _ in seen.arrivals if stamp is not None]
+    both = [pair for pair in zip(seen.headers, seen.logged, strict=True) if pair[0] != _NONE]
+    headers, logged = [stamp for stamp, _ in both], [log_ns for log_ns in seen.logged if log_ns != _NONE]
+    delays = [log_ns - stamp for stamp, log_ns in both if log_ns != _NONE]
     folder = topic.type.startswith("file/")
     return TopicReport(
         name=topic.name,
         type=topic.type,
         understood=topic.understood,
-        count=len(seen.arrivals),
+        count=len(seen.logged),
         rate_hz=_rate_hz(headers or logged),
         stamps=_span(headers),
         logged=_span(logged),
@@ -258,8 +273,8 @@ def _pair(pair: RigPair, how: str, seen: Mapping[str, _Seen], topics: Sequence[T
         camera_at_m=T_lidar_cam[:3, 3].tolist(),
         looks_along=T_lidar_cam[:3, 2].tolist(),
         vehicle_frame=pair.T_vehicle_lidar is not None,
-        sweeps=len(sweeps.arrivals),
-        images=len(images.arrivals),
+        sweeps=len(sweeps.logged),
+        images=len(images.logged),
         pairs=len(gaps),
         same_stamps=same,
         gap_ms=statistics.median(gaps) if gaps and not same else None,
@@ -274,9 +289,9 @@ def _gaps(pair: RigPair, sweeps: _Seen, images: _Seen, middle: int) -> list[floa
     """Image stamp minus middle of the sweep, ms, of each pair; found as the monitor finds them."""
     pairer = pairer_for(pair)
     arrivals = [
-        (log_ns, side, stamp, sequence)
+        (log_ns, side, stamp, None if sequence == _NONE else sequence)
         for side, topic in (("camera", images), ("lidar", sweeps))
-        for stamp, (_, log_ns, sequence) in zip(topic.stamps, topic.arrivals, strict=True)
+        for stamp, log_ns, sequence in zip(topic.stamps, topic.logged, topic.sequences, strict=True)
     ]
     paired = []
     for _, side, stamp, sequence in sorted(arrivals, key=lambda arrival: arrival[0]):

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from mcap.writer import CompressionType, Writer
 
 from monitor.cli import calibwatch, main
+from monitor.commands.inspect import _lines
 from monitor.inspection import inspect
 from monitor.messages import Transform
 from monitor.messages.camera_info import TYPE as INFO
@@ -21,6 +22,7 @@ from monitor.messages.point_cloud2 import TYPE as CLOUD
 from monitor.messages.point_cloud2 import encode_point_cloud2
 from monitor.messages.tf import TYPE as TF
 from monitor.messages.tf import encode_tf
+from pipeline.errors import CalibwatchError
 from pipeline.records import CameraImage, CameraModel, PointCloud
 from pipeline.se3 import inverse, transform
 
@@ -303,3 +305,19 @@ def test_recordings_are_as_they_were_published(folder, pairs, rings, gap_ms, poi
     assert cloud.points[1] == pytest.approx(points, rel=0.01)
     assert pair.problems == ()
     assert pair.in_view[0] > 2000
+
+
+def test_flipped_bytes_end_in_an_inspection_or_one_line(path):
+    """Damage anywhere: what can be read is told, and nothing escapes as another kind of error."""
+    recorded(path, cloud=PointCloud(sweep().xyz[:50]))
+    good, rng = path.read_bytes(), np.random.default_rng(7)
+    for _ in range(150):
+        data = bytearray(good)
+        for at in rng.integers(8, len(good), 3):
+            data[at] ^= int(rng.integers(1, 256))
+        path.write_bytes(data)
+        try:
+            found = inspect(str(path), None)
+        except CalibwatchError:
+            continue
+        assert "\n".join(_lines(found))

@@ -121,6 +121,8 @@ def _onset_text(status: Status) -> str:
     onset = status.onset
     if onset is None:
         return f"told since {stamp_text(status.since_ns)}"
+    if onset.stamp_ns == onset.from_ns:
+        return f"since {stamp_text(onset.from_ns)} or before, where the data begin"
     return f"since {stamp_text(onset.stamp_ns)} (between {span_text(onset.from_ns, onset.to_ns)})"
 
 

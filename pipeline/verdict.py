@@ -49,7 +49,10 @@ class VerdictParameters:
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """When a drift began: most likely stamp, and the interval that holds it, ns."""
+    """When a drift began: most likely stamp, and the interval that holds it, ns.
+
+    A most likely stamp at the beginning of the interval says that nothing before it was free of the drift.
+    """
 
     stamp_ns: int
     from_ns: int
@@ -69,8 +72,10 @@ class Memory:
         severity: Of a drift, or None.
         alarms: Alarming judgements in a row that agree.
         alarm_drift: Estimate (6,) of the last of them, or None.
-        alarmed_ns: Stamp of the first of them.
+        stirred_ns: Stamp of the first judgement with suspicion since the last one without.
         quiet_ns: Stamp of the last judgement without suspicion (at first: of the first data).
+        quiet_from_ns: Stamp of the oldest frame in that judgement's window (likewise): what moved late in a
+            window does not show in it.
         monitored_ns: Stamp at which every required axis was last monitored (at first: of the first data).
         last_seen_ns: Per axis the stamp at which it was last observable, or None.
         input_ns: Stamp of the last pair.
@@ -84,8 +89,9 @@ class Memory:
     severity: Literal["minor", "major"] | None
     alarms: int
     alarm_drift: Floats | None
-    alarmed_ns: int
+    stirred_ns: int
     quiet_ns: int
+    quiet_from_ns: int
     monitored_ns: int
     last_seen_ns: tuple[int | None, ...]
     input_ns: int
@@ -102,8 +108,9 @@ def start(now_ns: int) -> Memory:
         severity=None,
         alarms=0,
         alarm_drift=None,
-        alarmed_ns=now_ns,
+        stirred_ns=now_ns,
         quiet_ns=now_ns,
+        quiet_from_ns=now_ns,
         monitored_ns=now_ns,
         last_seen_ns=(None,) * len(AXES),
         input_ns=now_ns,
@@ -115,7 +122,7 @@ def paired(memory: Memory, now_ns: int) -> Memory:
     memory = dataclasses.replace(memory, input_ns=now_ns)
     if memory.state != "stale":
         return memory
-    fresh = dataclasses.replace(memory, quiet_ns=now_ns, monitored_ns=now_ns, alarms=0, alarm_drift=None)
+    fresh = _anew(memory, now_ns)
     if memory.severity is not None:
         return _enter(fresh, "drift_confirmed", "The drift told before the inputs stopped stands.", now_ns)
     return _enter(fresh, "collecting", "Inputs are back; evidence is being collected.", now_ns)
@@ -137,7 +144,7 @@ def faulted(memory: Memory, reason: str, now_ns: int) -> Memory:
 def advance(
     memory: Memory,
     judgement: Judgement,
-    now_ns: int,
+    window_ns: tuple[int, int],
     required: tuple[str, ...],
     limits: Floats,
     parameters: VerdictParameters,
@@ -147,17 +154,18 @@ def advance(
     Args:
         memory: Before it.
         judgement: Of the window that ends now.
-        now_ns: Stamp of the window's newest frame.
+        window_ns: Stamps of the window's oldest and newest frame; the newest is now.
         required: Axes that must be monitored for 'healthy'.
         limits: float64 (6,), alert limits.
         parameters: Hysteresis and patience.
     """
-    memory = _remembered(memory, judgement, now_ns, required, parameters)
+    now_ns = window_ns[1]
+    memory = _remembered(memory, judgement, window_ns, required, parameters)
     if memory.severity is not None:
         # Latched: only a new extrinsic or an acknowledgement ends a drift, whatever is seen later.
         return dataclasses.replace(memory, severity=_worse(memory.severity, _severity(judgement, limits)))
     if memory.alarms >= parameters.confirmations:
-        onset = Onset((memory.quiet_ns + memory.alarmed_ns) // 2, memory.quiet_ns, memory.alarmed_ns)
+        onset = Onset(memory.quiet_ns, memory.quiet_from_ns, memory.stirred_ns)
         memory = dataclasses.replace(memory, onset=onset, severity=_severity(judgement, limits))
         return _enter(memory, "drift_confirmed", _drift_reason(judgement, limits), now_ns)
     if judgement.contradicted:
@@ -201,9 +209,7 @@ def _quiet(
 
 def acknowledge(memory: Memory, now_ns: int) -> Memory:
     """A person has taken note of a drift: the latch opens and evidence is collected anew."""
-    opened = dataclasses.replace(
-        memory, severity=None, onset=None, alarms=0, alarm_drift=None, quiet_ns=now_ns, monitored_ns=now_ns
-    )
+    opened = dataclasses.replace(_anew(memory, now_ns), severity=None, onset=None)
     return _enter(opened, "collecting", "The drift was acknowledged; evidence is being collected.", now_ns)
 
 
@@ -228,11 +234,12 @@ def finish(memory: Memory, judgement: Judgement | None, frames: int, required: t
 def _remembered(
     memory: Memory,
     judgement: Judgement,
-    now_ns: int,
+    window_ns: tuple[int, int],
     required: tuple[str, ...],
     parameters: VerdictParameters,
 ) -> Memory:
     """Counts of alarms and last sightings brought up to date."""
+    oldest_ns, now_ns = window_ns
     agree = memory.alarm_drift is None or bool(
         np.all(
             np.abs(judgement.drift - memory.alarm_drift)
@@ -240,7 +247,8 @@ def _remembered(
         )
     )
     alarms = (memory.alarms + 1 if agree else 1) if judgement.alarming else 0
-    calm = not (judgement.alarming or judgement.suspicious or judgement.contradicted)
+    calm = not (judgement.alarming or judgement.suspicious or judgement.blind)
+    stirs = memory.stirred_ns <= memory.quiet_ns and not calm
     all_monitored = all(judgement.monitored[AXES.index(axis)] for axis in required)
     seen = tuple(
         now_ns if judgement.observable[axis] else memory.last_seen_ns[axis] for axis in range(len(AXES))
@@ -249,10 +257,24 @@ def _remembered(
         memory,
         alarms=alarms,
         alarm_drift=judgement.drift if judgement.alarming else None,
-        alarmed_ns=now_ns if alarms <= 1 else memory.alarmed_ns,
-        quiet_ns=now_ns if calm and not judgement.blind else memory.quiet_ns,
+        stirred_ns=now_ns if stirs else memory.stirred_ns,
+        quiet_ns=now_ns if calm else memory.quiet_ns,
+        quiet_from_ns=oldest_ns if calm else memory.quiet_from_ns,
         monitored_ns=now_ns if all_monitored else memory.monitored_ns,
         last_seen_ns=seen,
+    )
+
+
+def _anew(memory: Memory, now_ns: int) -> Memory:
+    """The memory with its evidence forgotten."""
+    return dataclasses.replace(
+        memory,
+        alarms=0,
+        alarm_drift=None,
+        stirred_ns=now_ns,
+        quiet_ns=now_ns,
+        quiet_from_ns=now_ns,
+        monitored_ns=now_ns,
     )
 
 

@@ -304,7 +304,7 @@ class Watch:
         self.memory = verdict.advance(
             self.memory,
             self.belief.judgement,
-            now_ns,
+            (min((*self.window_stamps, *self.line_stamps)), now_ns),
             self.mount.required,
             self.mount.limits,
             self.parameters.verdict,

@@ -88,7 +88,7 @@ class Evidence:
     Attributes:
         drift: float64 (6,), motion of the mount since the extrinsic was stored, rad and m.
         covariance: float64 (6,6), of its random error.
-        loss: Share of the best score lost when only the floor may explain it (0 where no score exists).
+        loss: Share of the best score lost when only the floor may explain it (inf where no score exists).
         contrast: Score at the estimate over chance, minus 1.
         peak: Height of that score over chance, in sigma (inf where no score exists).
         persistent: Whether each part of the window by itself prefers the estimate.
@@ -173,6 +173,8 @@ def judge(evidence: Evidence, C_ref: Floats, limits: Floats, parameters: DriftTe
     protection = (parameters.K_fa + parameters.K_md) * sigma + bound
     seen = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
     convincing = evidence.loss > parameters.least_loss and evidence.persistent and seen
+    # Without edges there is no score to lose: lines are judged by the joint statistic alone.
+    lost = parameters.suspicious_loss < evidence.loss < math.inf
     return Judgement(
         drift=evidence.drift,
         sigma=sigma,
@@ -183,7 +185,7 @@ def judge(evidence: Evidence, C_ref: Floats, limits: Floats, parameters: DriftTe
         excluded=np.abs(evidence.drift) + parameters.K_md * sigma + bound <= limits,
         statistic=statistic,
         alarming=statistic > parameters.alarm and convincing and not evidence.contradicted,
-        suspicious=seen and (statistic > parameters.suspicion or evidence.loss > parameters.suspicious_loss),
+        suspicious=seen and (statistic > parameters.suspicion or lost),
         blind=not seen,
         contradicted=evidence.contradicted,
     )

@@ -50,6 +50,12 @@ _LEAST_EDGES = 20
 _LINES_FRAMES = 3
 """Frames with matched lines before lines may testify: a wrong match seldom repeats itself."""
 
+_LINES_MISFIT = 2.0
+"""Residual statistic per degree of freedom above which some pairs of lines are wrong, and nobody knows which."""
+
+_LINES_REACH = 2.5
+"""Sigmas of the prior under which lines are matched: an answer beyond comes from lines taken for each other."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
@@ -372,7 +378,10 @@ class Watch:
         if not frames:
             return None
         solution = line_witness.solve_lines(frames, self.mount.camera, self.mount.T_cam_lidar)
-        return solution if solution.estimate.frames >= _LINES_FRAMES else None
+        estimate = solution.estimate
+        within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
+        fits = estimate.frames >= _LINES_FRAMES and estimate.chi2 <= _LINES_MISFIT
+        return solution if fits and within else None
 
 
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:

@@ -44,10 +44,8 @@ FLANK_M = (0.25, 0.60)
 """m; beside a stroke nothing is bright; a patch of bright ground has no such flanks."""
 PAINTED_SHARE = 0.2
 """Share of a metre's echoes in the stroke that are bright, at least: chance gives 0.02, paint a half."""
-CHANCE = 1e-6
+CHANCE = 1e-7
 """Probability that ground as bright as the flanks fills the stroke so much: some 1e4 strokes compete."""
-SIDES_ALIKE = 0.3
-"""Contrast to the brighter side over that to the darker one, at least."""
 CLAIM_M = 0.30
 """m; D0 of CRLF (3): bright points so near to a found line belong to it, and to no second one."""
 MAX_GAP_M = 13.0
@@ -61,8 +59,8 @@ FINALISTS = 20
 """Pairs with most echoes that are looked at metre by metre."""
 METRE_ECHOES = 3
 """Echoes of a metre that count: paint gives some on every metre of a dash, chance one here and there."""
-MIN_RADIAL = 0.5
-"""Change of range over length, at least: lines along a scan ring may be one laser that reads bright."""
+MIN_REACH_CHANGE_M = 0.3
+"""m; a chord of one scan ring changes its range by less: one laser may read bright."""
 MAX_LANES = 12
 """Lines per sweep; a road of six lanes has seven."""
 MAX_FAILURES = 6
@@ -212,40 +210,25 @@ def _stroke_frame(plan: Floats, members: Floats) -> tuple[Floats, Floats]:
 
 
 def _is_painted(surface: _Surface, stroke: Bools) -> bool:
-    """Whether a stroke of bright points (N,) is paint.
-
-    It is long, does not run along the scan rings, is brighter than chance makes it, and the ground is darker
-    on either side: a border between two grounds is not.
-    """
+    """Whether a stroke of bright points (N,) is paint: long, no scan ring, brighter than chance makes it."""
     members = surface.plan[stroke]
     along, across = _stroke_frame(surface.plan, members)
     own = along[stroke]
-    length = float(np.ptp(own))
     metres, echoes = np.unique(np.floor(own), return_counts=True)
     reach = np.hypot(members[:, 0], members[:, 1])
-    if length < MIN_LANE_M or len(metres) < MIN_LANE_METRES or np.ptp(reach) < MIN_RADIAL * length:
+    if np.ptp(own) < MIN_LANE_M or len(metres) < MIN_LANE_METRES or np.ptp(reach) < MIN_REACH_CHANGE_M:
         return False
-    lit = np.isin(np.floor(along), metres)
-    flanks = [lit & (side * across > FLANK_M[0]) & (side * across < FLANK_M[1]) for side in (-1, 1)]
-    # The ground may end beside an edge line: the side that is there must do.
-    flanks = [flank for flank in flanks if flank.sum() >= MIN_BACKGROUND]
-    if not flanks:
-        return False
-    beside = [float(surface.shade[flank].mean()) for flank in flanks]
-    both = np.logical_or.reduce(flanks)
-    # Chance is judged over the whole length: the metres of the stroke were chosen for being bright.
+    # Judged over the whole length: the metres of the stroke were chosen for being bright.
     span = (along >= own.min()) & (along <= own.max())
     inside = span & (np.abs(across) < REFIT_M[-1])
-    around = span & (np.abs(across) > FLANK_M[0]) & (np.abs(across) < FLANK_M[1])
+    beside = span & (np.abs(across) > FLANK_M[0]) & (np.abs(across) < FLANK_M[1])
+    if beside.sum() < MIN_BACKGROUND:
+        return False
     # One more than counted: a few dark flank points do not prove that bright ones are rare.
-    rate = (int((around & surface.bright).sum()) + 1) / (int(around.sum()) + 1)
+    rate = (int((beside & surface.bright).sum()) + 1) / (int(beside.sum()) + 1)
     # Capped per metre, or one bright cover outvotes the metres.
-    by_chance = float(pdtrc(float(np.minimum(echoes, METRE_ECHOES).sum()) - 1, rate * float(inside.sum())))
-    contrast = float(surface.shade[stroke].mean()) - max(beside)
-    # Ground that varies as much as paint stands out is not the even ground that paint lies on.
-    even = contrast > float(surface.shade[both].std())
-    alike = contrast > SIDES_ALIKE * (contrast + max(beside) - min(beside))
-    return by_chance < CHANCE and even and alike
+    echo_count = float(np.minimum(echoes, METRE_ECHOES).sum())
+    return bool(pdtrc(echo_count - 1, rate * float(inside.sum())) < CHANCE)
 
 
 def _longest_run(along: Floats, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:

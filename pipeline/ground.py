@@ -99,8 +99,6 @@ def fit_ground(cloud: PointCloud, up: Floats, rng: np.random.Generator) -> Groun
             return None
         plane = _least_squares(means, up)
     normal, offset = plane[:3], float(plane[3])
-    if normal @ up < math.cos(MAX_TILT):
-        return None
     distance = cloud.xyz @ normal.astype(np.float32) + np.float32(offset)
     return Ground(read_only(normal), offset, read_only(np.abs(distance) <= BAND_M / 2))
 

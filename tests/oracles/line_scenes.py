@@ -72,13 +72,15 @@ def line_sets(rng, *, lanes=LANES, poles=POLES, sigma_px=1.0, sigma_m=0.03, T_ca
     return cloud, image
 
 
-def sampled_cloud(rng, *, lanes=LANES, poles=POLES, radius=0.08, noise=0.02, dash=None, turn=None):
-    """Points of road, paint and pole fronts as a spinning sensor with 64 rings might give them.
+def sampled_cloud(
+    rng, *, lanes=LANES, poles=POLES, radius=0.08, noise=0.02, dash=None, turn=None, rings_deg=0.33
+):
+    """Points of road, paint and pole fronts as a spinning sensor might give them.
 
     Returns the cloud; ``turn`` (3,3) turns its frame.
     """
-    # 65 rings at a third of a degree, 0.18 deg from return to return.
-    elevation, angle = np.meshgrid(np.radians(np.arange(2.4, 24.0, 0.33)), np.arange(-0.9, 0.9, 0.0031))
+    # 0.18 deg from return to return.
+    elevation, angle = np.meshgrid(np.radians(np.arange(2.4, 24.0, rings_deg)), np.arange(-0.9, 0.9, 0.0031))
     angle = angle.ravel() + rng.uniform(0, 0.0031, angle.size)
     reach = HEIGHT / np.tan(elevation.ravel())
     road = np.column_stack([reach * np.cos(angle), reach * np.sin(angle), np.full(len(reach), -HEIGHT)])

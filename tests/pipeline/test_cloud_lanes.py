@@ -83,17 +83,33 @@ def test_scale_and_offset_of_intensity_do_not_matter():
     assert [line.points.tolist() for line in first] == [line.points.tolist() for line in second]
 
 
-@pytest.mark.parametrize("thing", ["patch", "verge", "ring", "cover"])
+@pytest.mark.parametrize("middle", [22.0, 23.0, 24.0])
+def test_one_laser_that_reads_bright_paints_no_line(middle):
+    """A ring is straight within a stroke's width over five metres of a far arc."""
+    rng = np.random.default_rng(8)
+    cloud = scenes.sampled_cloud(rng, lanes=[], poles=[], rings_deg=0.1)
+    reach = np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])
+    intensity = np.where(np.abs(reach - middle) < 0.2, 0.6, cloud.intensity).astype(np.float32)
+    assert found(PointCloud(cloud.xyz, intensity), rng) == []
+
+
+def test_a_stop_line_across_the_road_is_found():
+    rng = np.random.default_rng(9)
+    cloud = scenes.sampled_cloud(rng, lanes=[], poles=[], rings_deg=0.2)
+    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
+    on = (np.abs(x - 11.0) < 0.15) & (np.abs(y) < 6.0)
+    (line,) = found(PointCloud(cloud.xyz, np.where(on, 0.6, cloud.intensity).astype(np.float32)), rng)
+    assert off_axis(line, np.array([11.0, -6, -1.73]), np.array([11.0, 6, -1.73])) < 0.15
+
+
+@pytest.mark.parametrize("thing", ["patch", "verge", "cover"])
 def test_bright_ground_that_is_no_line(thing):
     rng = np.random.default_rng(7)
     cloud = scenes.sampled_cloud(rng, lanes=[], poles=[])
     x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
-    reach = np.hypot(x, y)
     bright = {
         "patch": (y > 2.0) & (y < 6.0) & (x > 5),
         "verge": y > 3.0,
-        # One laser that reads bright: straight over a few degrees of its turn.
-        "ring": np.abs(reach - 12.0) < 0.1,
         "cover": (np.abs(x - 9) < 0.4) & (np.abs(y - 1) < 0.4),
     }[thing]
     intensity = np.where(bright, 0.6, cloud.intensity).astype(np.float32)

@@ -79,7 +79,7 @@ def test_a_pole_on_the_border_of_a_cell_is_one_pole():
         assert len(found(cloud, rng)) == 1
 
 
-@pytest.mark.parametrize("thing", ["wall", "car", "leaning", "hedge row"])
+@pytest.mark.parametrize("thing", ["wall", "car", "leaning", "hedge row", "pole in a bush"])
 def test_upright_things_that_are_no_poles(thing):
     rng = np.random.default_rng(8)
     cloud = scenes.sampled_cloud(rng, poles=[])
@@ -89,6 +89,14 @@ def test_upright_things_that_are_no_poles(thing):
         "wall": np.column_stack([rng.uniform(8, 20, n), np.full(n, 6.0), z]),
         "car": np.column_stack([rng.uniform(10, 14, n), rng.uniform(4, 5.8, n), z]),
         "leaning": np.column_stack([12.0 + 0.3 * z, np.full(n, 4.0), z]),
+        # Twigs around the stem, too low to be tall themselves.
+        "pole in a bush": np.column_stack(
+            [
+                12.0 + np.where(z > 0, 0.02, 0.9) * rng.uniform(-1, 1, n),
+                5.0 + np.where(z > 0, 0.02, 0.9) * rng.uniform(-1, 1, n),
+                np.where(z > 0, rng.uniform(-1.0, 1.5, n), rng.uniform(-0.9, -0.1, n)),
+            ]
+        ),
         "hedge row": np.column_stack([rng.uniform(9, 10.5, n), rng.uniform(4, 4.4, n), z]),
     }
     xyz = np.concatenate([cloud.xyz, shapes[thing].astype(np.float32)])

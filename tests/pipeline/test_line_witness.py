@@ -99,6 +99,21 @@ def test_what_is_held_does_not_spoil_what_is_seen():
     assert abs(drift[5]) < 4 * seen.axis_sigmas[5]
 
 
+def test_the_prior_does_not_pull_a_weakly_seen_direction():
+    """Far poles know forward no better than the prior does; the mean answer is still the true one."""
+    injected = np.array([0, 0, 0, 0.3, 0, 0])
+    stored = se3.stored_before(scenes.TRUTH, injected, None)
+    rng = np.random.default_rng(14)
+    forward, sigma = [], []
+    for _ in range(40):
+        one = frame(rng, poles=[(32.0, -6.0), (40.0, 6.0)], sigma_px=0.7)
+        drift, seen = in_axes(solve_lines([one], scenes.CAMERA, stored).estimate)
+        forward.append(drift[3])
+        sigma.append(seen.axis_sigmas[3])
+    assert 0.1 < np.median(sigma) < 0.45
+    assert np.mean(forward) == pytest.approx(0.3, abs=0.08)
+
+
 @pytest.mark.parametrize("kind", ["no frames", "empty frames", "nothing alike"])
 def test_nothing_matched_is_no_information(kind):
     rng = np.random.default_rng(5)

@@ -119,6 +119,12 @@ def start(now_ns: int) -> Memory:
 
 def paired(memory: Memory, now_ns: int) -> Memory:
     """A pair came in: a stale state ends, with its evidence to be collected anew."""
+    if now_ns < memory.input_ns:
+        # The clock ran back (a recording in a loop): stamps of before would lie in the future.
+        seen = tuple(None if stamp is None or stamp > now_ns else stamp for stamp in memory.last_seen_ns)
+        memory = dataclasses.replace(
+            _anew(memory, now_ns), since_ns=min(memory.since_ns, now_ns), last_seen_ns=seen
+        )
     memory = dataclasses.replace(memory, input_ns=now_ns)
     if memory.state != "stale":
         return memory
@@ -163,7 +169,12 @@ def advance(
     memory = _remembered(memory, judgement, window_ns, required, parameters)
     if memory.severity is not None:
         # Latched: only a new extrinsic or an acknowledgement ends a drift, whatever is seen later.
-        return dataclasses.replace(memory, severity=_worse(memory.severity, _severity(judgement, limits)))
+        if judgement.alarming:
+            worse = _worse(memory.severity, _severity(judgement, limits))
+            memory = dataclasses.replace(memory, severity=worse)
+        if memory.state == "drifted":
+            return memory
+        return _enter(memory, "drift_confirmed", "The drift told before the fault stands.", now_ns)
     if memory.alarms >= parameters.confirmations:
         onset = Onset(memory.quiet_ns, memory.quiet_from_ns, memory.stirred_ns)
         memory = dataclasses.replace(memory, onset=onset, severity=_severity(judgement, limits))
@@ -248,7 +259,7 @@ def _remembered(
     )
     alarms = (memory.alarms + 1 if agree else 1) if judgement.alarming else 0
     calm = not (judgement.alarming or judgement.suspicious or judgement.blind)
-    stirs = memory.stirred_ns <= memory.quiet_ns and not calm
+    stirs = memory.stirred_ns <= memory.quiet_ns and (judgement.alarming or judgement.suspicious)
     all_monitored = all(judgement.monitored[AXES.index(axis)] for axis in required)
     seen = tuple(
         now_ns if judgement.observable[axis] else memory.last_seen_ns[axis] for axis in range(len(AXES))

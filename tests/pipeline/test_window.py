@@ -22,7 +22,7 @@ small = st.builds(
 
 
 def by_definition(stamps, p):
-    """What stays, as the field docs say it: young enough, dense at the end, one a slot before, newest first."""
+    """What stays, as the field docs say it: young, dense at the end, one a slot before, newest first."""
     young = [i for i, stamp in enumerate(stamps) if stamps[-1] - stamp <= p.longest_ns]
     dense = [i for i in young if i >= len(stamps) - p.dense_frames]
     slots = {}

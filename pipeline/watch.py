@@ -51,10 +51,10 @@ _LINES_FRAMES = 3
 """Frames with matched lines before lines may testify: a wrong match seldom repeats itself."""
 
 _LINES_MISFIT = 2.0
-"""Residual statistic per degree of freedom above which some pairs of lines are wrong, and nobody knows which."""
+"""Residual statistic per degree of freedom above which some pairs of lines are wrong, nobody knows which."""
 
 _LINES_REACH = 2.5
-"""Sigmas of the prior under which lines are matched: an answer beyond comes from lines taken for each other."""
+"""Sigmas of the prior of the matching: an answer beyond it comes from lines taken for each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

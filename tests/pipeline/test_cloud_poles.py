@@ -79,7 +79,7 @@ def test_a_pole_on_the_border_of_a_cell_is_one_pole():
         assert len(found(cloud, rng)) == 1
 
 
-@pytest.mark.parametrize("thing", ["wall", "car", "leaning", "hedge row", "pole in a bush"])
+@pytest.mark.parametrize("thing", ["wall", "car", "leaning", "hedge row", "pole in a bush", "drum"])
 def test_upright_things_that_are_no_poles(thing):
     rng = np.random.default_rng(8)
     cloud = scenes.sampled_cloud(rng, poles=[])
@@ -97,6 +97,7 @@ def test_upright_things_that_are_no_poles(thing):
                 np.where(z > 0, rng.uniform(-1.0, 1.5, n), rng.uniform(-0.9, -0.1, n)),
             ]
         ),
+        "drum": np.column_stack([12.0 + rng.uniform(-0.34, 0.34, n), 5.0 + rng.uniform(-0.34, 0.34, n), z]),
         "hedge row": np.column_stack([rng.uniform(9, 10.5, n), rng.uniform(4, 4.4, n), z]),
     }
     xyz = np.concatenate([cloud.xyz, shapes[thing].astype(np.float32)])

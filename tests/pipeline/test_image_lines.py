@@ -88,6 +88,16 @@ def test_dashes_of_one_line_become_one_line():
     assert np.linalg.norm(line.end - line.start) > 330
 
 
+def test_a_fine_mask_of_a_long_lens_gives_the_same_line_as_a_coarse_one():
+    long_lens = CameraModel("pinhole", np.diag([4.0, 4.0, 1.0]) @ K, np.zeros(0), 1920, 1280)
+    strokes = [("pole", (900.0, 150.0), (930.0, 1150.0), 60.0)]
+    for scale in (1.0, 0.5, 0.25):
+        image, masks = scenes.draw(strokes, size=(1920, 1280), rng=np.random.default_rng(6), scale=scale)
+        (line,) = find_image_lines(image, masks, long_lens)
+        assert np.abs(distances(line, (900.0, 150.0), (930.0, 1150.0))).max() < 0.3
+        assert np.linalg.norm(line.end - line.start) > 900
+
+
 def test_lines_side_by_side_stay_apart():
     strokes = [("lane", (30.0 + x, 310.0), (180.0 + x, 150.0), 6.0) for x in (0.0, 40.0, 250.0)]
     image, masks = scenes.draw(strokes, rng=np.random.default_rng(3))

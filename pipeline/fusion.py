@@ -16,6 +16,9 @@ _WEIGHTS = np.linspace(0.0, 1.0, 21)
 _PRIOR_SIGMA = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
 """rad, m; a prior so wide that it only keeps a direction without any information invertible (it is held)."""
 
+_ROUNDING = 1e-9
+"""Share of the largest information below which a direction is null (FORMULAS D3)."""
+
 CONTRADICTION = (10.83, 13.82, 16.27, 18.47, 20.52, 22.46)
 """Chi-square thresholds at 1e-3 for 1 to 6 degrees of freedom (FORMULAS F2)."""
 
@@ -39,11 +42,14 @@ class Testimony:
 
 def contradiction(a: Testimony, b: Testimony) -> bool:
     """Whether two witnesses, their own floors included, differ by more than their errors allow, at 1e-3."""
-    A, B = a.information, b.information
-    parallel = A @ np.linalg.pinv(A + B, hermitian=True) @ B
-    difference = a.drift - b.drift
-    rank = int(np.linalg.matrix_rank(parallel * np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA), hermitian=True))
-    return rank > 0 and float(difference @ parallel @ difference) > CONTRADICTION[rank - 1]
+    scale = np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA)
+    A, B = a.information * scale, b.information * scale
+    values, vectors = np.linalg.eigh(A @ np.linalg.pinv(A + B, hermitian=True) @ B)
+    # Rounding leaves a trace in directions that only one of them knows: no degree of freedom.
+    common = values > max(1.0, _ROUNDING * float(values[-1]))
+    difference = vectors[:, common].T @ ((a.drift - b.drift) / _PRIOR_SIGMA)
+    rank = int(common.sum())
+    return rank > 0 and float(values[common] @ difference**2) > CONTRADICTION[rank - 1]
 
 
 def intersected(a: Testimony, b: Testimony) -> Testimony:

@@ -298,7 +298,12 @@ class Watch:
         stirred = self.memory.state in ("suspect", "drifted") and self.memory.severity is None
         frames = max(len(self._edge_frames), len(self._line_frames))
         due = window.judgement_due(
-            now_ns, self._judged_ns, frames, soon=beginning or stirred, parameters=self.parameters.window
+            now_ns,
+            self._judged_ns,
+            frames,
+            soon=stirred,
+            parameters=self.parameters.window,
+            beginning=beginning,
         )
         if not due:
             return findings

@@ -16,7 +16,8 @@ class WindowParameters:
         longest_ns: Older than this leaves: a verdict speaks of now.
         least_frames: Frames before the first judgement: single frames are off by 0.2 deg (PROBE 2).
         judge_every_ns: Time between judgements while nothing stirs.
-        judge_soon_ns: The same while there is suspicion and at the beginning.
+        judge_soon_ns: The same while there is suspicion.
+        judge_first_ns: The same at the beginning: each frame of a 10 Hz sensor.
         beginning_ns: How long the beginning lasts: recordings of incidents may be as short.
     """
 
@@ -27,7 +28,8 @@ class WindowParameters:
     least_frames: int = 5
     judge_every_ns: int = 1 * _NS
     judge_soon_ns: int = 200_000_000
-    beginning_ns: int = 2 * _NS
+    judge_first_ns: int = 100_000_000
+    beginning_ns: int = 1_200_000_000
 
 
 def retained(stamps_ns: list[int], parameters: WindowParameters) -> list[int]:
@@ -49,7 +51,13 @@ def retained(stamps_ns: list[int], parameters: WindowParameters) -> list[int]:
 
 
 def judgement_due(
-    now_ns: int, judged_ns: int | None, frames: int, *, soon: bool, parameters: WindowParameters
+    now_ns: int,
+    judged_ns: int | None,
+    frames: int,
+    *,
+    soon: bool,
+    parameters: WindowParameters,
+    beginning: bool = False,
 ) -> bool:
     """Whether the window should be judged now; depends on stamps alone, so that a replay repeats a drive."""
     if frames < parameters.least_frames:
@@ -57,5 +65,6 @@ def judgement_due(
     if judged_ns is None:
         return True
     wait = parameters.judge_soon_ns if soon else parameters.judge_every_ns
+    wait = parameters.judge_first_ns if beginning else wait
     # A tenth of slack: stamps of a 10 Hz sensor jitter by milliseconds.
     return now_ns - judged_ns >= wait - wait // 10

@@ -1,6 +1,6 @@
 """Draws docs/drift.png from the folder of a demo: ``python docs/drift_picture.py out/demo docs/drift.png``.
 
-Left: the street with the LiDAR's edges under the stored extrinsic; right: under the estimated one; below: the yaw
+Left: the LiDAR edges under the stored extrinsic; right: under the estimated one; below: the yaw
 that the monitor tells over time.
 """
 
@@ -24,7 +24,7 @@ from pipeline.watch import Mount
 
 ORANGE, BLUE, GREY, RED, INK = (0, 120, 255), (255, 150, 0), (170, 170, 170), (60, 60, 220), (60, 50, 40)
 CROP = (470, 90, 480, 190)
-"""Left, top, width, height of the part of the image that is shown, px: poles and facades at middle distance."""
+"""Left, top, width, height of the part of the image that is shown, px: poles and facades."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 

@@ -1,7 +1,7 @@
 """The figures in docs/results.md: ``python -m tests.results FOLDER`` with a folder of recordings (DESIGN 11).
 
-Every sequence is judged with its own extrinsic and with extrinsics that are wrong by a known amount; every single
-frame is calibrated. Markdown goes to stdout. The engine is the one that ``replay`` drives; outputs are left out.
+Every sequence is judged with its own extrinsic and with ones that are wrong by a known amount; every single
+frame is calibrated. Markdown goes to stdout. The engine is the one of ``replay``, without its outputs.
 """
 
 import dataclasses

@@ -119,6 +119,8 @@ def watch(
     Raises:
         InputError: Not one frame could be used, for a reason that lies in the input.
     """
+    for engine in watching_.engines.values():
+        engine.attach(losses, lambda: watching_.outputs.losses)
     pairs, arrival_ns = 0, 0
     for item in messages:
         if stop.is_set():

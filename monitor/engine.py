@@ -1,7 +1,7 @@
 """FramePair or Tick in, events out: the only place where a frame becomes a verdict."""
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from monitor.clock import Clock
 from monitor.events import Event, FrameEvent, StatusEvent
 from monitor.intake import Intake
+from monitor.sources import Losses
 from monitor.statements import Identity, Measured, status_of
 from monitor.status import Rates, Timing
 from pipeline.records import FramePair
@@ -50,6 +51,8 @@ class Engine:
         self._cloud_ns: deque[int] = deque(maxlen=_STAMPS)
         self._image_ns: deque[int] = deque(maxlen=_STAMPS)
         self.wrong_size: tuple[int, int] | None = None
+        self._losses = Losses()
+        self._outputs_lost: Callable[[], Mapping[str, str]] = dict
 
     @property
     def used(self) -> int:
@@ -60,6 +63,11 @@ class Engine:
     def dropped(self) -> Counter[str]:
         """Sweeps and images of pairs that gave no evidence, by reason."""
         return self._dropped
+
+    def attach(self, losses: Losses, outputs_lost: Callable[[], Mapping[str, str]]) -> None:
+        """Names what else a status tells: messages that the source lost, and outputs that are lost."""
+        self._losses = losses
+        self._outputs_lost = outputs_lost
 
     def step(self, pair: FramePair, arrival_ns: int) -> list[Event]:
         """Takes a pair in: what was seen in it, and the status where one is due.
@@ -110,19 +118,21 @@ class Engine:
         assert memory is not None  # noqa: S101 - set by the first step, tick or finish
         self._told, self._told_ns = (memory.state, memory.code), self._now_ns
         received, dropped = self._intake.account(self.identity.pair)
+        lost = Counter(self._losses.counts)
         status = status_of(
             self.identity,
             self.watch.mount,
             memory,
             self.watch.belief,
             Measured(
-                received=received,
+                received=received + lost.total(),
                 used=self._used,
-                dropped=dropped + self._dropped,
+                dropped=dropped + self._dropped + lost,
                 window_ns=self.watch.window_stamps,
                 lines_ns=self.watch.line_stamps,
                 rates=self._rates(),
                 timing={name: _quantiles(values) for name, values in self._timing.items()},
+                outputs_lost=self._outputs_lost(),
             ),
             self._seq,
             self._now_ns,

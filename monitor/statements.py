@@ -64,6 +64,7 @@ class Measured:
         lines_ns: Stamps of the window's frames with lines.
         rates: Of the inputs.
         timing: Stage -> quantiles.
+        outputs_lost: Output -> what happened.
     """
 
     received: int
@@ -73,6 +74,7 @@ class Measured:
     lines_ns: tuple[int, ...]
     rates: Rates
     timing: Mapping[str, Timing]
+    outputs_lost: Mapping[str, str]
 
 
 def status_of(
@@ -116,6 +118,7 @@ def status_of(
         extrinsic=identity.extrinsic,
         model=identity.model,
         software=identity.software,
+        outputs_lost=dict(measured.outputs_lost),
     )
 
 

@@ -242,6 +242,9 @@ class Status(_Part):
     extrinsic: Provenance
     model: Provenance
     software: str
+    outputs_lost: dict[Code, str] = Field(
+        default={}, description="output -> what happened: recording lost, disk full, ..."
+    )
 
     def to_json(self) -> str:
         """One line of JSON."""

@@ -4,6 +4,7 @@ A cloud with times per point is straightened by them. One without is straightene
 sense of rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,12 @@ _LONGEST_REACH_S = 0.3
 
 _TRACK_EVERY_NS = 300_000_000
 """ns; a registration holds so long: at 3 m/s^2 a sweep is then bent wrongly by 2 cm at its ends, at most."""
+
+_ASK_APART = 3
+"""Sweeps between two that are asked: the bend that tells the sense grows with the way between them."""
+
+_LONGEST_TURN_S = 0.3
+"""s; sweeps further apart than this are not one turn after the other."""
 
 _MOST_EVIDENCE = 12
 """Pairs of sweeps that are asked for the sense of rotation; a vehicle that stands never tells it."""
@@ -61,6 +68,8 @@ class Ego:
         self._sense: SpinSense | None = spin
         self._asked = spin is not None
         self._evidence: list[SpinEvidence] = []
+        self._recent: deque[tuple[int, Surfels]] = deque(maxlen=_ASK_APART)
+        self._period_s: float | None = None
         self._tried = 0
         self._previous: tuple[int, PointCloud | Surfels] | None = None
         self._tracked_ns: int | None = None
@@ -77,6 +86,7 @@ class Ego:
         self._previous = None
         self._tracked_ns = None
         self._twist = None
+        self._recent.clear()
 
     def straighten(self, pair: FramePair) -> Straightened:
         """Tracks the motion up to this sweep, and brings the sweep to the exposure of its image."""
@@ -93,6 +103,7 @@ class Ego:
         if seconds <= 0:
             self.forget()
             return pair.cloud
+        self._period_s = seconds
         held = self._tracked_ns is not None and pair.cloud_stamp_ns - self._tracked_ns < _TRACK_EVERY_NS
         seen: PointCloud | Surfels = pair.cloud
         if not held or self._asks(pair):
@@ -107,12 +118,26 @@ class Ego:
         found = estimate_twist(before, seen, seconds, self._twist)
         self._twist = found.twist if isinstance(found, Motion) else None
         self._tracked_ns = pair.cloud_stamp_ns if self._twist is not None else None
-        if self._asks(pair) and self._twist is not None and pair.sweep_s is not None:
-            self._ask(spin_evidence(before, seen, seconds, pair.sweep_s, self._axis, self._twist))
+        if not self._asks(pair):
+            return
+        turn_s = self._turn_s(pair)
+        if len(self._recent) == _ASK_APART and self._twist is not None and turn_s is not None:
+            earlier_ns, earlier = self._recent[0]
+            apart_s = (pair.cloud_stamp_ns - earlier_ns) / _NS
+            self._ask(spin_evidence(earlier, seen, apart_s, turn_s, self._axis, self._twist))
+        self._recent.append((pair.cloud_stamp_ns, seen))
 
     def _asks(self, pair: FramePair) -> bool:
         """Whether the sense of rotation is still open and this sweep may tell it."""
-        return not self._asked and pair.cloud.time is None and pair.sweep_s is not None
+        return not self._asked and pair.cloud.time is None
+
+    def _turn_s(self, pair: FramePair) -> float | None:
+        """Duration of a turn: as the source states it, else the time from one sweep to the next."""
+        if pair.sweep_s is not None:
+            return pair.sweep_s
+        if self._period_s is None or self._period_s > _LONGEST_TURN_S:
+            return None
+        return self._period_s
 
     def _ask(self, answer: object) -> None:
         """Collects what sweeps say of the sense of rotation until it is sure or asked often enough."""
@@ -127,9 +152,14 @@ class Ego:
     def _at_exposure(self, pair: FramePair) -> PointCloud | None:
         if self._twist is None:
             return None
-        reference_s = (pair.image_stamp_ns - pair.cloud_stamp_ns) / _NS
         time = self._times(pair)
-        if time is None or abs(reference_s - float(np.median(time))) > _LONGEST_REACH_S:
+        if time is None:
+            return None
+        reference_s = (pair.image_stamp_ns - pair.cloud_stamp_ns) / _NS
+        if pair.cloud.time is None and pair.sweep_s is None:
+            # What the stamp of such a sweep means is not known; the beams meet the camera's view at mid turn.
+            reference_s = 0.5 * (self._turn_s(pair) or 0.0)
+        if abs(reference_s - float(np.median(time))) > _LONGEST_REACH_S:
             return None
         return deskew(pair.cloud, time, self._twist, reference_s)
 
@@ -141,6 +171,7 @@ class Ego:
         """
         if pair.cloud.time is not None:
             return pair.cloud.time
-        if self._sense is None or pair.sweep_s is None:
+        turn_s = self._turn_s(pair)
+        if self._sense is None or turn_s is None:
             return None
-        return sweep_times(pair.cloud, pair.sweep_s, Spin(self._sense, self._axis, -self._ahead))
+        return sweep_times(pair.cloud, turn_s, Spin(self._sense, self._axis, -self._ahead))

@@ -56,6 +56,7 @@ STATUS = {
     "extrinsic": {"hash": "ab", "version": "1"},
     "model": {"hash": None, "version": None},
     "software": "calibwatch 0.1.0",
+    "outputs_lost": {"recording": "No space left on device"},
 }
 
 

@@ -123,7 +123,8 @@ def _config(settings: BusSettings) -> zenoh.Config:
         return zenoh.Config.from_json5(json.dumps(document))
     except zenoh.ZError as error:
         raise RigError(
-            "the settings of the bus are refused by zenoh", hint="see `calibwatch config show`"
+            "the settings of the bus are refused by zenoh",
+            hint="check the endpoints and the files of the identity",
         ) from error
 
 

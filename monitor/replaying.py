@@ -20,6 +20,9 @@ from pipeline.segmentation import Segmenter
 OUTPUTS = ("status_log", "summary", "recording", "report")
 """What a replay writes (DESIGN 7)."""
 
+FILE_NAMES = (FILE_NAME, "status.jsonl", "report.html", "recording.rrd")
+"""Under which names."""
+
 
 def replay(
     location: str,
@@ -58,7 +61,8 @@ def replay(
             f"folder {out} can not be made: {error.strerror}", hint="--out wants a folder"
         ) from error
     # What an earlier run left there must not pass for this one's.
-    (out / FILE_NAME).unlink(missing_ok=True)
+    for name in FILE_NAMES:
+        (out / name).unlink(missing_ok=True)
     outputs = open_outputs(OUTPUTS, Surroundings(prepared.rig.vehicle, folder=out, images_hz=images_hz))
     try:
         under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())

@@ -172,4 +172,6 @@ def _refusal(error: ValidationError, where: str) -> RigError:
         )
     if first["type"] == "literal_error":
         return RigError(f"{where}: {path} is {first['input']!r}", hint=f"wanted {first['ctx']['expected']}")
-    return RigError(f"{where}: {path}: {first['msg']}", hint="see `calibwatch config schema`")
+    return RigError(
+        f"{where}: {path}: {first['msg']}", hint="monitor/spec.md lists the keys with their units"
+    )

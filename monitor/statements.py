@@ -124,7 +124,8 @@ def status_of(
 
 def _drift(mount: Mount, memory: verdict.Memory, belief: Belief | None) -> Drift:
     axes: dict[str, AxisDrift] = {}
-    limits = mount.limits * TO_PEOPLE
+    # Rounded: 0.75 deg is 0.75 again after its way through radians.
+    limits = np.round(mount.limits * TO_PEOPLE, 9)
     for index, name in enumerate(AXIS_NAMES):
         if belief is None:
             axes[name] = AxisDrift(

@@ -16,21 +16,19 @@ _SURE_SIGMAS = 3.0
 """An axis without a limit crossed is named as moved when its drift exceeds this many sigma."""
 
 NEXT_STEPS: dict[State, str] = {
-    "healthy": "Nothing to do. The axes that were not checked need other roads, or a `calibwatch baseline`, "
-    "before anything can be said of them.",
+    "healthy": "Nothing to do. The axes that were not checked need other roads, where they are seen better.",
     "drifted": "Look at the places below. If the points under the estimated extrinsic lie on the edges of "
     "the image and those under the stored one do not, check the mount (bracket, windscreen, bolts), run "
-    "`calibwatch calibrate` on a recording made after that and take the result over with `calibwatch "
-    "extrinsic accept`. Until then do not rely on the projection between this LiDAR and this camera.",
+    "`calibwatch calibrate` on a recording made after that, and put the extrinsic that it prints into the "
+    "rig file. Until then do not rely on the projection between this LiDAR and this camera.",
     "suspect": "Keep driving: more evidence settles it. If it stays suspect on several drives, inspect the "
-    "mount and learn a `calibwatch baseline`, which narrows what can be told.",
-    "unobservable": "No statement is possible from what was seen. Drive longer, and where there are poles, "
-    "kerbs and lane markings in good light; `calibwatch inspect` tells whether the inputs are those of the "
-    "rig file.",
+    "mount and measure the extrinsic anew: what is known better can be tested closer.",
+    "unobservable": "No statement is possible from these scenes. Drive longer, where there are poles, kerbs "
+    "and lane markings in good light; `calibwatch inspect` tells whether the inputs are what the rig file "
+    "says.",
     "stale": "Pairs of sweep and image stopped coming. Check drivers, cables and clocks; `calibwatch "
     "inspect` lists topics, rates and gaps between the stamps.",
-    "fault": "The watch can not work until this is mended: the reason names it. `calibwatch config check` "
-    "tries rig file, model and folders.",
+    "fault": "The watch can not work until this is mended: the reason names it.",
     "starting": "Give it more data: a first verdict takes some ten seconds on a road with lanes and poles.",
 }
 """What to do next, by state; words between backticks are commands."""

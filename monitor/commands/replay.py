@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from monitor.outputs.summary import Summary
     from pipeline.records import Floats
 
-OUTPUTS = ("status_log", "summary", "recording", "report")
-"""What a replay writes (DESIGN 7)."""
-
 
 @click.command(
     epilog="Examples: calibwatch replay drive.mcap --out out/drive; "

@@ -1,4 +1,4 @@
-"""The only place that asks what time it is: stamps of the data decide verdicts, this decides staleness and cost."""
+"""The only place that asks what time it is; verdicts go by the stamps of the data."""
 
 import time
 from typing import Protocol

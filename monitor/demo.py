@@ -1,4 +1,4 @@
-"""The whole product on a simulated drive: simulate, record, replay over zenoh, judge, tell what was told when."""
+"""The whole product on a simulated drive: simulate, record, replay over zenoh, judge, tell."""
 
 import math
 import shutil
@@ -106,9 +106,8 @@ def demo(out: Path, seed: int, stop: threading.Event, progress: Callable[[str], 
 def _timeline(summary: Summary) -> tuple[tuple[str, ...], bool]:
     """What was told when, in seconds of the drive, and whether that is what should be told."""
     pair = summary.pairs["front"]
-    lines = [
-        f"{DRIFT_S:6.2f} s  TRUTH       the mount turns {YAW_DEG:+.2f} deg in yaw and slips {LEFT_M:+.3f} m left"
-    ]
+    truth = f"the mount turns {YAW_DEG:+.2f} deg in yaw and slips {LEFT_M:+.3f} m left"
+    lines = [f"{DRIFT_S:6.2f} s  TRUTH       {truth}"]
     drifted_s = None
     for change in pair.timeline:
         seconds = (change.stamp_ns - START_NS) / 1e9
@@ -120,7 +119,8 @@ def _timeline(summary: Summary) -> tuple[tuple[str, ...], bool]:
         return (*lines, "The drift was not told."), False
     drift = pair.last.drift
     lines.append(
-        f"told {drifted_s - DRIFT_S:.2f} s after it happened: yaw {drift.yaw.value:+.2f} deg (truth {YAW_DEG:+.2f}), "
+        f"told {drifted_s - DRIFT_S:.2f} s after it happened: "
+        f"yaw {drift.yaw.value:+.2f} deg (truth {YAW_DEG:+.2f}), "
         f"left {drift.left.value:+.3f} m (truth {LEFT_M:+.3f})"
     )
     return tuple(lines), drifted_s >= DRIFT_S

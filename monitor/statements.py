@@ -1,4 +1,4 @@
-"""Belief and memory of a watch -> the status that is told (DESIGN 5). Radians become degrees here and only here."""
+"""Belief and memory of a watch -> the status that is told (DESIGN 5). Radians become degrees here alone."""
 
 import math
 from collections import Counter

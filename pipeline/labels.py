@@ -1,7 +1,7 @@
 """The label contract between training and run time: class order, names, colours. Imports nothing."""
 
 VERSION = "1"
-"""Changes whenever the order or meaning of a class changes; the .onnx carries it and a mismatch is refused."""
+"""Changes with the order or meaning of a class; the .onnx carries it and a mismatch is refused."""
 
 IGNORE = 255
 """Label value of pixels that take no part in training or evaluation."""

@@ -212,7 +212,7 @@ def _quiet(
     doubtful = [axis for axis in wanted if not judgement.excluded[axis]]
     if doubtful:
         names = " and ".join(_size(judgement, axis) for axis in doubtful)
-        reason = f"{names} is more than its limit allows, but within the stored extrinsic's own uncertainty."
+        reason = f"{names} may exceed its limit, but lies within the stored extrinsic's own uncertainty."
         return _enter(memory, "within_stored_uncertainty", reason, now_ns)
     named = ", ".join(AXES[a] for a in range(len(AXES)) if judgement.monitored[a] and judgement.excluded[a])
     return _enter(memory, "within_limits", f"Drift beyond the alert limits is excluded in {named}.", now_ns)

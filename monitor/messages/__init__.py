@@ -1,8 +1,8 @@
 """Messages: bytes <-> values of ``pipeline.records``. Every module here offers ``CODECS``.
 
-``CODECS`` maps a type name (``sensor_msgs/msg/PointCloud2``, ``foxglove.PointCloud``, ``file/pcd``, ...) to a function
-``(Message) -> tuple[Decoded, ...]``. A message that can not be decoded raises :class:`~pipeline.errors.InputError`;
-sizes are checked before anything is allocated.
+``CODECS`` maps a type name (``sensor_msgs/msg/PointCloud2``, ``foxglove.PointCloud``, ``file/pcd``, ...) to a
+function ``(Message) -> tuple[Decoded, ...]``. A message that can not be decoded raises
+:class:`~pipeline.errors.InputError`; sizes are checked before anything is allocated.
 """
 
 import importlib
@@ -24,14 +24,14 @@ class Message:
 
     Attributes:
         topic: Topic, key expression or folder it came from.
-        type: Type name, the key of the codec: ROS types as ``pkg/msg/Name`` (ROS 1 too), ``foxglove.Name``, or
-            ``file/<suffix>`` (file/bin file/npz file/pcd file/ply file/pcd.bin file/png file/jpg).
+        type: Type name, the key of the codec: ROS types as ``pkg/msg/Name`` (ROS 1 too), ``foxglove.Name``,
+            or ``file/<suffix>`` (file/bin file/npz file/pcd file/ply file/pcd.bin file/png file/jpg).
         encoding: How ``data`` is written.
         data: The bytes, owned by the message.
         log_ns: When the source recorded or received it, ns.
-        stamp_ns: Stamp of the measurement where the source knows it (folders do); None: it stands in the message.
+        stamp_ns: Stamp of the measurement where the source knows it (folders do); None: the message tells.
         sequence: Sequence number of the publisher where the transport gives one.
-        sweep_s: Duration of the sweep in s where the source knows it (KITTI timestamps_start/end, ``t_cloud_end``).
+        sweep_s: Duration of the sweep, s, where the source knows it (KITTI start and end, ``t_cloud_end``).
     """
 
     topic: str

@@ -23,6 +23,13 @@ _RING_STRAYS = 0.05
 _OWN_SHARE = 0.05
 """Median distance of a point from its ring's elevation, as a share of the sensor's vertical field of view."""
 
+_SHARP_SHARE = 0.1
+"""The same as a share of the spacing of rings that were read off the elevations alone. Clouds of six sensors
+that keep their elevation lay below 0.005, points in no order above 0.3."""
+
+_RING_POINTS = 10
+"""Points of the median ring that was read off the elevations; a peak of fewer is chance."""
+
 _LEAST_STEP_RAD = 1e-6
 """Points nearer to each other on a ring are echoes of one beam, and no step."""
 
@@ -31,6 +38,12 @@ _STEP_NOISE_RAD = 1e-3
 
 _LEVEL_SHARE = 0.03
 """Share of the range by which neighbours on one surface differ at most."""
+
+_CUT_RAD = math.radians(20.0)
+"""A longer way to the next point leads over a part of the turn that was cut out of the sweep."""
+
+_SEAM_BINS = 720
+"""Bins of the turn in which the end of the rings is sought: half a degree holds a step of every sensor."""
 
 _ELEVATION_BIN_RAD = math.radians(0.02)
 """Bin of the elevation histogram; a tenth of the closest ring spacing on sale."""
@@ -110,7 +123,7 @@ def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
     if by_order is not None and _believable(by_order, elevation):
         return by_order
     by_elevation = _rings_by_elevation(elevation)
-    if by_elevation is not None and _believable(by_elevation, elevation):
+    if by_elevation is not None and _sharp(by_elevation, elevation):
         return by_elevation
     return None
 
@@ -123,38 +136,55 @@ def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDA
     # Ring after ring means small steps forward nearly always; column after column does not.
     if float(np.mean((step > -_STEP_NOISE_RAD) & (step < math.radians(5.0)))) < 1.0 - _RING_STRAYS:
         return None
-    backward = step < -math.radians(20.0)
-    travelled = np.concatenate([[0.0], np.cumsum(np.where(backward, 0.0, step))])
-    count = travelled[-1] / (2.0 * math.pi) + int(backward.sum())
+    backward = step < -_CUT_RAD
+    # In a sweep cut to a part of the turn the way over what was cut is still a way forward.
+    travelled = np.concatenate([[0.0], np.cumsum(np.where(backward, step + 2.0 * math.pi, step))])
+    count = travelled[-1] / (2.0 * math.pi)
     if not _FEWEST_RINGS <= count <= _MOST_RINGS:
         return None
-    seam = _seam(np.mod(azimuth * sense, 2.0 * math.pi), elevation, distance)
+    cut = np.abs(step) > _CUT_RAD
+    seam = _seam(np.mod(azimuth * sense, 2.0 * math.pi), elevation, distance, cut, count)
     turns = (travelled + azimuth[0] * sense - seam) / (2.0 * math.pi)
-    ring = np.floor(turns).astype(np.int64) + np.concatenate([[0], np.cumsum(backward)])
+    ring = np.floor(turns).astype(np.int64)
     ring -= ring[0]
     # Where a ring ends a point's ring is not sure, and no edge may be seen between it and the next.
     unsure = np.abs(turns - np.rint(turns)) * 2.0 * math.pi < 2.0 * float(np.median(step))
     return np.where(unsure, -1, ring)
 
 
-def _seam(azimuth: Floats, elevation: Floats, distance: Floats) -> float:
+def _seam(
+    azimuth: Floats, elevation: Floats, distance: Floats, cut: NDArray[np.bool_], turns: float
+) -> float:
     """Azimuth in 0..2 pi at which one ring ends and the next begins: the elevation jumps there every turn.
 
     Inside a ring it jumps only where the range does (lasers sit some centimetres apart) and comes back, so
-    steps of range are left out and the rest is summed with its sign.
+    steps of range are left out, but for those over a ``cut`` (N-1,), and the rest is summed with its sign.
     """
     change = np.diff(elevation)
-    turns = max(1.0, float(np.sum(np.abs(np.diff(azimuth)) > math.pi)))
     spacing = float(np.ptp(elevation)) / turns
-    level = np.abs(np.diff(distance)) < _LEVEL_SHARE * distance[1:]
+    level = cut | (np.abs(np.diff(distance)) < _LEVEL_SHARE * distance[1:])
     jumps = level & (np.abs(change) > 0.25 * spacing) & (np.abs(change) < 5.0 * spacing)
     sums, borders = np.histogram(
-        azimuth[1:][jumps], bins=720, range=(0.0, 2.0 * math.pi), weights=change[jumps]
+        azimuth[1:][jumps], bins=_SEAM_BINS, range=(0.0, 2.0 * math.pi), weights=change[jumps]
     )
     best = int(np.argmax(np.abs(sums + np.roll(sums, 1) + np.roll(sums, -1))))
     offset = np.mod(azimuth[1:] - borders[best] + math.pi, 2.0 * math.pi) - math.pi
     near = jumps & (np.abs(offset) < 2.0 * (borders[1] - borders[0]))
-    return float(np.mod(borders[best] + (np.median(offset[near]) if near.any() else 0.0), 2.0 * math.pi))
+    seam = borders[best] + (np.median(offset[near]) if near.any() else 0.0)
+    return float(np.mod(seam - 0.5 * _empty_before(azimuth, best), 2.0 * math.pi))
+
+
+def _empty_before(azimuth: Floats, seam_bin: int) -> float:
+    """Width of the part of the turn without points that ends at the seam, rad; 0 for a whole turn.
+
+    In a sweep that was cut there, the first points of the rings lie along the cut and not at one azimuth.
+    """
+    empty = np.histogram(azimuth, bins=_SEAM_BINS, range=(0.0, 2.0 * math.pi))[0] == 0
+    before = np.roll(empty, _SEAM_BINS - seam_bin - 1)[::-1]
+    # The cut may pass through the bin of the seam, or one beside it.
+    first = int(np.argmax(before[:3]))
+    run = int(np.argmin(before[first:])) if before[first] else 0
+    return run * 2.0 * math.pi / _SEAM_BINS
 
 
 def _rings_by_elevation(elevation: Floats) -> NDArray[np.int64] | None:
@@ -183,6 +213,22 @@ def _believable(ring: NDArray[np.int64], elevation: Floats) -> bool:
     medians = medians[np.isfinite(medians)]
     own = np.median(np.abs(elevation - _medians(elevation[order], ring[order])[ring]))
     return bool(own < _OWN_SHARE * np.ptp(medians) and len(medians) >= _FEWEST_RINGS)
+
+
+def _sharp(ring: NDArray[np.int64], elevation: Floats) -> bool:
+    """Whether peaks of the elevation are rings: of many points, each far nearer to its own than to the next.
+
+    Points in no order make peaks too, as wide as the valleys between them.
+    """
+    sure = ring >= 0
+    ring, elevation = ring[sure], elevation[sure]
+    order = np.argsort(ring, kind="stable")
+    medians = _medians(elevation[order], ring[order])
+    off = float(np.median(np.abs(elevation - medians[ring])))
+    counts = np.bincount(ring)
+    if np.median(counts[counts > 0]) < _RING_POINTS or np.isfinite(medians).sum() < _FEWEST_RINGS:
+        return False
+    return off < _SHARP_SHARE * float(np.median(np.diff(medians[np.isfinite(medians)])))
 
 
 def _medians(values: Floats, group: NDArray[np.int64], count: int | None = None) -> Floats:

@@ -1,7 +1,6 @@
 """Engines around one stream of messages: what `run` and `replay` share."""
 
 import hashlib
-import logging
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -15,19 +14,15 @@ from monitor.events import EndEvent, Event
 from monitor.intake import Intake
 from monitor.messages import Message
 from monitor.outputs import Outputs
+from monitor.refusal import Account, drop_notes, refuse_unusable
 from monitor.rig import Rig, RigPair
 from monitor.sources import Losses, Tick
 from monitor.statements import Identity
 from monitor.status import Provenance, State, first_in_precedence
-from pipeline.errors import InputError, RigError
+from pipeline.errors import RigError
 from pipeline.parameters import Parameters
 from pipeline.segmentation import Segmenter
 from pipeline.watch import Mount, Watch
-
-_log = logging.getLogger(__name__)
-
-SCENE_REASONS = frozenset({"no_scan_pattern", "no_edges", "empty_cloud"})
-"""Drop reasons that speak of scene or sensor; the others speak of an input that is wrong."""
 
 
 def software() -> str:
@@ -51,17 +46,27 @@ class Watching:
         intake: Decodes and pairs.
         engines: One per pair, by name.
         outputs: Tell the world.
+        tell: Told at once, one sentence each, what people should know of the inputs and the outputs.
     """
 
     intake: Intake
     engines: dict[str, Engine]
     outputs: Outputs
+    tell: Callable[[str], None]
 
 
 def watching(
-    rig: Rig, segmenter: Segmenter | None, parameters: Parameters, outputs: Outputs, clock: Clock
+    rig: Rig,
+    segmenter: Segmenter | None,
+    parameters: Parameters,
+    outputs: Outputs,
+    clock: Clock,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Watching:
-    """Sets up engines for every pair of a complete rig."""
+    """Sets up engines for every pair of a complete rig.
+
+    Without ``tell`` what people should know is told at the end only, in the warnings of the EndEvent.
+    """
     intake = Intake(rig)
     model = Provenance(hash=None, version=None)
     if segmenter is not None:
@@ -77,7 +82,7 @@ def watching(
             software=software(),
         )
         engines[pair.name] = Engine(identity, Watch(mount, parameters, segmenter), intake, clock)
-    return Watching(intake, engines, outputs)
+    return Watching(intake, engines, outputs, tell)
 
 
 def mount_of(pair: RigPair) -> Mount:
@@ -121,90 +126,61 @@ def watch(
     """
     for engine in watching_.engines.values():
         engine.attach(losses, lambda: watching_.outputs.losses)
-    pairs, arrival_ns = 0, 0
-    for item in messages:
-        if stop.is_set():
-            break
-        arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
-        for pair in watching_.intake.take(item) if isinstance(item, Message) else ():
-            pairs += 1
-            _tell(watching_.outputs, watching_.engines[pair.pair].step(pair, arrival_ns))
-            if progress is not None:
-                progress(pairs)
-        for engine in watching_.engines.values():
-            _tell(watching_.outputs, engine.tick(arrival_ns))
+    arrival_ns = _feed(watching_, messages, stop, progress)
     interrupted = stop.is_set()
     if not interrupted:
         for pair in watching_.intake.flush():
-            _tell(watching_.outputs, watching_.engines[pair.pair].step(pair, arrival_ns))
-        _refuse_unusable(watching_, losses)
+            _tell(watching_, watching_.engines[pair.pair].step(pair, arrival_ns))
+        refuse_unusable(_accounts(watching_), watching_.intake, losses)
     for engine in watching_.engines.values():
-        _tell(watching_.outputs, engine.finish())
+        _tell(watching_, engine.finish())
     note = "interrupted: what came after is not judged" if interrupted else ""
-    warnings = (*losses.notes, *watching_.intake.notes, *_drop_notes(watching_))
-    watching_.outputs.handle(EndEvent(complete=not interrupted, note=note, warnings=warnings))
+    lost = [f"output lost: {name}: {why}" for name, why in watching_.outputs.losses.items()]
+    drops = drop_notes(_accounts(watching_), watching_.intake)
+    warnings = (*losses.notes, *watching_.intake.notes, *drops, *lost)
+    _tell(watching_, [EndEvent(complete=not interrupted, note=note, warnings=warnings)])
     memories = [engine.watch.memory for engine in watching_.engines.values()]
     return first_in_precedence(memory.state for memory in memories if memory is not None)
 
 
-def _tell(outputs: Outputs, events: Sequence[Event]) -> None:
+def _feed(
+    watching_: Watching,
+    messages: Iterable[Message | Tick],
+    stop: threading.Event,
+    progress: Callable[[int], None] | None,
+) -> int:
+    """Until the messages end or ``stop`` is set; gives the time of the last one, ns."""
+    intake, engines = watching_.intake, watching_.engines
+    pairs, arrival_ns, told = 0, 0, 0
+    for item in messages:
+        if stop.is_set():
+            break
+        arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
+        for pair in intake.take(item) if isinstance(item, Message) else ():
+            pairs += 1
+            _tell(watching_, engines[pair.pair].step(pair, arrival_ns))
+            if progress is not None:
+                progress(pairs)
+        for engine in engines.values():
+            _tell(watching_, engine.tick(arrival_ns))
+        for note in intake.notes[told:]:
+            watching_.tell(note)
+        told = len(intake.notes)
+    return arrival_ns
+
+
+def _tell(watching_: Watching, events: Sequence[Event]) -> None:
+    """Hands events to the outputs; one that is lost meanwhile is told at once."""
+    outputs = watching_.outputs
     before = set(outputs.losses)
     for event in events:
         outputs.handle(event)
     for name in set(outputs.losses) - before:
-        _log.error("output lost: %s: %s", name, outputs.losses[name])
+        watching_.tell(f"output lost: {name}: {outputs.losses[name]}")
 
 
-def _refuse_unusable(watching_: Watching, losses: Losses) -> None:
-    """InputError where no frame of any pair was used although frames came, or none came at all."""
-    if any(engine.used for engine in watching_.engines.values()):
-        return
-    for name, engine in watching_.engines.items():
-        received, early = watching_.intake.account(name)
-        dropped = early + engine.dropped
-        if set(dropped) & SCENE_REASONS:
-            return
-        if received == 0:
-            detail = "; ".join(losses.notes) or "no sweep and no image came"
-            raise InputError(f"pair {name}: {detail}", hint="calibwatch inspect lists topics and pairs")
-        raise InputError(_why_unusable(name, engine, watching_.intake, dropped), hint=_hint(dropped))
-
-
-def _why_unusable(name: str, engine: Engine, intake: Intake, dropped: dict[str, int]) -> str:
-    reason = max(dropped, key=lambda r: dropped[r]) if dropped else "no_partner"
-    if reason == "undecodable" and intake.notes:
-        return intake.notes[0]
-    if reason == "wrong_type" and intake.notes:
-        return intake.notes[0]
-    if reason == "image_size" and engine.wrong_size is not None:
-        camera = engine.watch.mount.camera
-        have, want = engine.wrong_size, (camera.width, camera.height)
-        return f"pair {name}: images are {have[0]}x{have[1]} px, the rig says {want[0]}x{want[1]}"
-    offset = intake.offset_ns(name)
-    if reason in ("no_partner", "gap_too_large") and offset is not None:
-        return (
-            f"pair {name}: no sweep and image belong together; camera stamps are {offset / 1e9:+.3f} s "
-            "from LiDAR stamps"
-        )
-    counts = ", ".join(f"{r} {n}" for r, n in sorted(dropped.items()))
-    return f"pair {name}: no frame could be used ({counts or 'nothing was paired'})"
-
-
-def _hint(dropped: dict[str, int]) -> str:
-    if "image_size" in dropped:
-        return "give the intrinsics for this size"
-    if set(dropped) & {"no_partner", "gap_too_large"}:
-        return "synchronise the clocks, or set max_gap_ms in the rig file"
-    return "calibwatch inspect tells what the recording holds"
-
-
-def _drop_notes(watching_: Watching) -> list[str]:
-    """One line per pair that lost frames."""
-    notes = []
-    for name, engine in watching_.engines.items():
-        received, early = watching_.intake.account(name)
-        dropped = early + engine.dropped
-        if dropped:
-            counts = ", ".join(f"{n} {reason}" for reason, n in sorted(dropped.items()))
-            notes.append(f"pair {name}: {sum(dropped.values())} of {received} frames dropped ({counts})")
-    return notes
+def _accounts(watching_: Watching) -> list[Account]:
+    return [
+        Account(name, engine.used, engine.dropped, engine.watch.mount.camera, engine.wrong_size)
+        for name, engine in watching_.engines.items()
+    ]

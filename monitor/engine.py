@@ -45,6 +45,7 @@ class Engine:
         self._told_ns: int | None = None
         self._now_ns = 0
         self._arrival: tuple[int, int] | None = None
+        self._paired = False
         self._used = 0
         self._dropped: Counter[str] = Counter()
         self._timing: dict[str, deque[float]] = {}
@@ -76,6 +77,9 @@ class Engine:
             pair: A sweep and its image.
             arrival_ns: When the message that completed it came, on the clock of the source.
         """
+        if not self._paired:
+            # What was told before it bears stamps of the source's clock, which need not be the data's.
+            self._paired, self.watch.memory = True, None
         self._now_ns = pair.image_stamp_ns
         self._arrival = (pair.image_stamp_ns, arrival_ns)
         self._cloud_ns.append(pair.cloud_stamp_ns)
@@ -91,7 +95,7 @@ class Engine:
         return [self._frame_event(pair, findings), *self._due()]
 
     def tick(self, arrival_ns: int) -> list[Event]:
-        """No pair came until ``arrival_ns`` of the source's clock: stamps are taken to have run on as long."""
+        """No pair came until ``arrival_ns`` of the source's clock: stamps are taken to run on."""
         if self._arrival is None:
             self._arrival = (arrival_ns, arrival_ns)
         data_ns, since_ns = self._arrival

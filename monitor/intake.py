@@ -1,6 +1,5 @@
-"""Messages in, pairs of sweep and image out, with an account of every frame: decoding and pairing for a whole rig."""
+"""Messages in, pairs of sweep and image out, with an account of every frame: the intake of a whole rig."""
 
-import logging
 from collections import Counter
 from dataclasses import dataclass
 
@@ -9,8 +8,6 @@ from monitor.rig import Rig, RigPair, camera_from_info
 from monitor.sync import Paired, Pairer, Side, middle_ns, pairer_for
 from pipeline.errors import CalibwatchError, InputError
 from pipeline.records import CameraImage, CameraModel, FramePair, PointCloud
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +35,9 @@ class Intake:
 
     Args:
         rig: Every topic is named.
+
+    Attributes:
+        notes: What people should know of the input, one sentence each, at most a few per topic.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -74,7 +74,7 @@ class Intake:
         try:
             decoded = decode(message)
         except InputError as error:
-            self._tell(message.topic, str(error))
+            self._tell(message.topic, "undecodable", str(error))
             for lane, _ in lanes:
                 lane.dropped["undecodable"] += 1
             return []
@@ -98,6 +98,12 @@ class Intake:
             stamp_ns = one.stamp_ns or message.log_ns
             match one.value, side:
                 case PointCloud() as cloud, "lidar":
+                    if cloud.intensity is None and len(cloud) > 0:
+                        self._tell(
+                            message.topic,
+                            "no intensity",
+                            f"topic {message.topic} has no intensity: its clouds show no lane markings",
+                        )
                     frame = _Frame(stamp_ns, cloud, message.sweep_s)
                     compared = middle_ns(stamp_ns, cloud, message.sweep_s, lane.pair.lidar.stamp)
                     found = lane.pairer.push_lidar(compared, frame, message.sequence)
@@ -107,7 +113,9 @@ class Intake:
                 case _:
                     lane.dropped["wrong_type"] += 1
                     self._tell(
-                        message.topic, f"topic {message.topic} carries {message.type}, not {_wanted(side)}"
+                        message.topic,
+                        "wrong_type",
+                        f"topic {message.topic} carries {message.type}, not {_wanted(side)}",
                     )
                     continue
             pairs += [_frame_pair(lane.pair, paired) for paired in found]
@@ -125,18 +133,16 @@ class Intake:
                         one.value, rectified=lane.pair.camera.rectified, topic=topic
                     )
                 except CalibwatchError as error:
-                    self._tell(topic, str(error))
+                    self._tell(topic, "intrinsics", str(error))
 
     def _lane(self, pair: str) -> _Lane:
         return next(lane for lane in self._lanes if lane.pair.name == pair)
 
-    def _tell(self, topic: str, what: str) -> None:
-        """One line for people the first time a topic gives trouble; counts tell the rest."""
-        key = (topic, what.partition(":")[0])
-        if key not in self._told:
-            self._told.add(key)
+    def _tell(self, topic: str, trouble: str, what: str) -> None:
+        """One line for people the first time a topic gives a kind of trouble; counts tell the rest."""
+        if (topic, trouble) not in self._told:
+            self._told.add((topic, trouble))
             self.notes.append(what)
-            _log.warning("%s", what)
 
 
 def _side_of(pair: RigPair, topic: str) -> Side | None:

@@ -1,5 +1,6 @@
 """Live sensors on a zenoh bus under watch: the daemon behind ``calibwatch run``."""
 
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +22,8 @@ from monitor.status import State
 from pipeline.errors import InputError, RigError
 from pipeline.parameters import Parameters
 from pipeline.segmentation import Segmenter
+
+_log = logging.getLogger(__name__)
 
 FILES = ("status_log", "summary", "recording", "report")
 """What goes into ``--out``."""
@@ -79,7 +82,7 @@ def run(
         surroundings = Surroundings(rig.vehicle, folder=out, session=session, images_hz=images_hz)
         outputs = open_outputs(("status_bus", *(FILES if out is not None else ())), surroundings)
         try:
-            under_watch = watching(rig, segmenter, Parameters(), outputs, clock)
+            under_watch = watching(rig, segmenter, Parameters(), outputs, clock, _log.warning)
             with ZenohLive(session, subscriptions(rig), now_ns=now_ns, stop=stop) as source:
                 if ready is not None:
                     ready()

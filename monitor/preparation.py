@@ -6,8 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from monitor.discovery import VEHICLE_FRAMES, Survey, compose, discover, path, survey_in
-from monitor.rig import Rig, RigPair, bind, camera_from_info, inject, load_rig, parse_rig
-from monitor.sources import Source, TopicInfo, open_source
+from monitor.rig import (
+    Rig,
+    RigPair,
+    bind,
+    camera_from_info,
+    inject,
+    is_cloud,
+    is_image,
+    load_rig,
+    parse_rig,
+)
+from monitor.sources import Source, TopicInfo, open_source, zenoh_live
 from pipeline.errors import InputError, RigError
 from pipeline.records import Floats
 
@@ -37,6 +47,8 @@ def prepare(location: str, rig_file: Path | None, drift: Floats | None) -> Prepa
         InputError: The recording can not be read or does not hold what the rig names.
         RigError: The rig file is wrong, or something it leaves open is not in the recording.
     """
+    if zenoh_live.SOURCE.matches(location) and not Path(location).exists():
+        raise InputError(f"{location} is a bus, not a recording", hint="calibwatch run watches a bus")
     with open_source(location) as source:
         own = source.rig_document()
         topics = source.describe()
@@ -49,8 +61,26 @@ def prepare(location: str, rig_file: Path | None, drift: Floats | None) -> Prepa
             )
         else:
             return Prepared(*_with_drift(*_discovered(source, topics, location), drift))
+    _check_types(rig, topics, location)
     rig = completed(rig, lambda: _survey(location, topics))
     return Prepared(*_with_drift(rig, notes, drift))
+
+
+def _check_types(rig: Rig, topics: Sequence[TopicInfo], location: str) -> None:
+    """InputError where a topic of the rig carries something else than its side of the pair needs."""
+    types = {topic.name: topic.type for topic in topics}
+    for pair in rig.pairs:
+        for topic, fits, what in (
+            (pair.lidar.topic, is_cloud, "a point cloud"),
+            (pair.camera.topic, is_image, "an image"),
+        ):
+            if topic is not None and not fits(types[topic]):
+                fitting = ", ".join(name for name, kind in types.items() if fits(kind))
+                raise InputError(
+                    f"{location}: topic {topic} (pair {pair.name}) carries "
+                    f"{types[topic] or 'no known type'}, not {what}",
+                    hint=f"{what} is in: {fitting}" if fitting else f"no topic here carries {what}",
+                )
 
 
 def _with_drift(rig: Rig, notes: tuple[str, ...], drift: Floats | None) -> tuple[Rig, tuple[str, ...]]:

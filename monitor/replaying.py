@@ -1,14 +1,14 @@
 """A recording from its file to the files that judge it."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from monitor.bus_replay import OverBus
 from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
 from monitor.model_file import model_bytes
-from monitor.outputs import Surroundings, open_outputs
+from monitor.outputs import Outputs, Surroundings, open_outputs, write_whole
 from monitor.outputs.summary import FILE_NAME, Summary
 from monitor.preparation import prepare
 from monitor.sources import open_source
@@ -54,16 +54,7 @@ def replay(
     """
     prepared = prepare(location, rig_file, drift)
     segmenter = Segmenter(model_bytes(model))
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"folder {out} can not be made: {error.strerror}", hint="--out wants a folder"
-        ) from error
-    # What an earlier run left there must not pass for this one's.
-    for name in FILE_NAMES:
-        (out / name).unlink(missing_ok=True)
-    outputs = open_outputs(OUTPUTS, Surroundings(prepared.rig.vehicle, folder=out, images_hz=images_hz))
+    outputs = _opened(out, prepared.rig.vehicle, images_hz)
     try:
         under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
         source = open_source(location)
@@ -71,4 +62,38 @@ def replay(
             watch(under_watch, messages, messages.losses, stop, progress)
     finally:
         outputs.close()
+    if outputs.losses:
+        raise _lost(out, outputs.losses)
     return Summary.model_validate_json((out / FILE_NAME).read_bytes())
+
+
+def _opened(out: Path, vehicle: str, images_hz: float) -> Outputs:
+    """The outputs, in a place where nothing of an earlier run can pass for this one's."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in FILE_NAMES:
+            (out / name).unlink(missing_ok=True)
+        return open_outputs(OUTPUTS, Surroundings(vehicle, folder=out, images_hz=images_hz))
+    except OSError as error:
+        raise InputError(
+            f"folder {out} can not be written to: {error.strerror}", hint="name another folder with --out"
+        ) from error
+
+
+def _lost(out: Path, losses: Mapping[str, str]) -> InputError:
+    """What to tell when files are missing; a summary that was written no longer says that all is there."""
+    what = "; ".join(f"{name}: {why}" for name, why in losses.items())
+    path, state = out / FILE_NAME, "not told"
+    try:
+        written = Summary.model_validate_json(path.read_bytes())
+        state = written.state
+        path.unlink()
+        note = f"not everything could be written: {what}"
+        marked = written.model_copy(update={"complete": False, "note": note})
+        write_whole(path, marked.model_dump_json(indent=2).encode() + b"\n")
+    except OSError:
+        path.unlink(missing_ok=True)
+    return InputError(
+        f"not everything could be written to {out} (verdict: {state}): {what}",
+        hint="is the disk full? make room, or name another folder with --out",
+    )

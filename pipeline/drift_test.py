@@ -6,7 +6,7 @@ extrinsic's own uncertainty. The last one widens the claim 'it moved', not the p
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +95,8 @@ class Evidence:
         persistent: Whether each part of the window by itself prefers the estimate.
         frames: Frames in the window.
         contradicted: Whether the two witnesses differ by more than their errors allow.
+        feigned: float64 (6,), drift that an error of one sigma in the time between sweep and image would feign:
+            forward or sync can not be told apart by one window (FORMULAS G1).
     """
 
     drift: Floats
@@ -105,6 +107,7 @@ class Evidence:
     persistent: bool
     frames: int
     contradicted: bool = False
+    feigned: Floats = field(default_factory=lambda: np.zeros(6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,10 +170,10 @@ def judge(evidence: Evidence, C_ref: Floats, limits: Floats, parameters: DriftTe
         parameters: Thresholds.
     """
     sigma = np.sqrt(np.diag(evidence.covariance))
-    P = evidence.covariance + parameters.floor() + C_ref
+    P = evidence.covariance + parameters.floor() + np.outer(evidence.feigned, evidence.feigned) + C_ref
     P_inverse = np.linalg.inv(P)
     statistic = float(evidence.drift @ P_inverse @ evidence.drift)
-    bound = parameters.bound()
+    bound = parameters.bound() + 2.0 * np.abs(evidence.feigned)
     protection = (parameters.K_fa + parameters.K_md) * sigma + bound
     seen = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
     convincing = evidence.loss > parameters.least_loss and evidence.persistent and seen

@@ -9,7 +9,7 @@ same car is one witness.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,12 +68,15 @@ class EdgeFrame:
         edges: Edges of the cloud.
         gradients: Gradients of the image.
         distance_m: Way driven so far, m.
+        feigned: float64 (6,), drift in vehicle axes that an error of one sigma in the time between sweep and
+            image would feign (FORMULAS G1).
     """
 
     stamp_ns: int
     edges: Edges
     gradients: GradientPyramid
     distance_m: float = 0.0
+    feigned: Floats = field(default_factory=lambda: np.zeros(6))
 
 
 NEW_SCENE_M = 20.0

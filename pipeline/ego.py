@@ -28,6 +28,16 @@ _LONGEST_REACH_S = 0.3
 _TRACK_EVERY_NS = 300_000_000
 """ns; a registration holds so long: at 3 m/s^2 a sweep is then bent wrongly by 2 cm at its ends, at most."""
 
+SYNC_KNOWN_S = 0.003
+"""s; error of stamps that hardware sets, where each point's time is known."""
+
+SYNC_TURN_S = 0.010
+"""s; where the turn is known but not its beginning, or what a compensated sweep was compensated to: the beams
+pass through a camera's view in some 25 ms."""
+
+SYNC_UNKNOWN_S = 0.025
+"""s; where nothing tells when in the turn a point was measured: a quarter of a turn at 10 Hz."""
+
 _ASK_APART = 3
 """Sweeps between two that are asked: the bend that tells the sense grows with the way between them."""
 
@@ -46,11 +56,15 @@ class Straightened:
         cloud: The sweep, brought to the exposure where that was possible.
         straight: Whether it was.
         distance_m: Way driven since the start, m, as far as the motion was known.
+        twist: Motion of the LiDAR, or None where it is not known.
+        sync_s: How well the time between points and exposure is known, one sigma, s.
     """
 
     cloud: PointCloud
     straight: bool
     distance_m: float
+    twist: Twist | None
+    sync_s: float
 
 
 class Ego:
@@ -71,6 +85,7 @@ class Ego:
         self._recent: deque[tuple[int, Surfels]] = deque(maxlen=_ASK_APART)
         self._period_s: float | None = None
         self._tried = 0
+        self._one_instant = False
         self._previous: tuple[int, PointCloud | Surfels] | None = None
         self._tracked_ns: int | None = None
         self._twist: Twist | None = None
@@ -95,7 +110,16 @@ class Ego:
             seen = self._advance(pair, *self._previous)
         self._previous = (pair.cloud_stamp_ns, seen)
         cloud = self._at_exposure(pair)
-        return Straightened(cloud or pair.cloud, cloud is not None, self._distance_m)
+        return Straightened(
+            cloud or pair.cloud, cloud is not None, self._distance_m, self._twist, self._sync_s(pair)
+        )
+
+    def _sync_s(self, pair: FramePair) -> float:
+        """How well the time between points and exposure is known."""
+        if pair.cloud.time is not None or (self._sense is not None and pair.sweep_s is not None):
+            return SYNC_KNOWN_S
+        known = self._sense is not None or self._one_instant or pair.sweep_s is not None
+        return SYNC_TURN_S if known else SYNC_UNKNOWN_S
 
     def _advance(self, pair: FramePair, before_ns: int, before: PointCloud | Surfels) -> PointCloud | Surfels:
         """Registers this sweep with the one before when that is due; gives what the next one needs of it."""
@@ -146,6 +170,7 @@ class Ego:
             self._evidence.append(answer)
         told = spin_sense(self._evidence)
         self._asked = told is not None or self._tried >= _MOST_EVIDENCE
+        self._one_instant = told == "one instant"
         if told == "cw" or told == "ccw":  # noqa: PLR1714 - narrows the type
             self._sense = told
 
@@ -156,7 +181,7 @@ class Ego:
         if time is None:
             return None
         reference_s = (pair.image_stamp_ns - pair.cloud_stamp_ns) / _NS
-        if pair.cloud.time is None and pair.sweep_s is None:
+        if pair.cloud.time is None and self._sense is not None and pair.sweep_s is None:
             # What the stamp of such a sweep means is not known; the beams meet the camera's view at mid turn.
             reference_s = 0.5 * (self._turn_s(pair) or 0.0)
         if abs(reference_s - float(np.median(time))) > _LONGEST_REACH_S:
@@ -171,6 +196,8 @@ class Ego:
         """
         if pair.cloud.time is not None:
             return pair.cloud.time
+        if self._one_instant:
+            return np.full(len(pair.cloud), 0.5 * (pair.sweep_s or 0.0), dtype=np.float32)
         turn_s = self._turn_s(pair)
         if self._sense is None or turn_s is None:
             return None

@@ -17,7 +17,7 @@ from pipeline.deskew import SpinSense
 from pipeline.drift_test import Evidence, Judgement
 from pipeline.edge_witness import EdgeFrame, EdgeSolution
 from pipeline.edges import RING_JUMP, find_edges
-from pipeline.ego import Ego
+from pipeline.ego import Ego, Straightened
 from pipeline.fusion import Testimony
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground
@@ -95,6 +95,20 @@ class Mount:
     def forward(self) -> Floats:
         """Unit vector ahead (of the vehicle, else of the camera), LiDAR frame."""
         return np.asarray(self.R_vehicle_cam[0] @ self.T_cam_lidar[:3, :3], dtype=np.float64)
+
+    def feigned(self, sweep: Straightened) -> Floats:
+        """Drift (6,), vehicle axes, that one sigma of error in a sweep's time would feign (FORMULAS G1)."""
+        R_vehicle_lidar = self.R_vehicle_cam @ self.T_cam_lidar[:3, :3]
+        if sweep.twist is None:
+            return np.array([0.0, 0.0, 0.0, sweep.sync_s * _ASSUMED_M_S, 0.0, 0.0])
+        centre = -self.T_cam_lidar[:3, :3].T @ self.T_cam_lidar[:3, 3]
+        velocity = sweep.twist.velocity + np.cross(sweep.twist.omega, centre)
+        motion = np.concatenate([R_vehicle_lidar @ sweep.twist.omega, R_vehicle_lidar @ velocity])
+        return np.asarray(sweep.sync_s * motion, dtype=np.float64)
+
+
+_ASSUMED_M_S = 10.0
+"""m/s ahead where the motion is not known: a street in town."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,7 +258,11 @@ class Watch:
         if edges is not None and enough:
             with stage("gradients"):
                 gradients = gradient_pyramid(pair.image, mount.camera)
-            self._edge_frames.append(EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m))
+            self._edge_frames.append(
+                EdgeFrame(
+                    pair.image_stamp_ns, edges, gradients, straight.distance_m, self.mount.feigned(straight)
+                )
+            )
         found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
         dropped: DropReason | None = None
         if not enough and not found_lines:
@@ -331,7 +349,8 @@ class Watch:
         B = se3.vehicle_block(R_vc)
         C_ref = drift_test.stored_covariance(mount.sigma_rad, mount.sigma_m)
         floor = test.floor()
-        edges = self._solve_edges(B.T @ (floor + C_ref) @ B)
+        feigned = np.mean([f.feigned for f in self._edge_frames] or [np.zeros(6)], axis=0)
+        edges = self._solve_edges(B.T @ (floor + np.outer(feigned, feigned) + C_ref) @ B)
         lines = self._solve_lines()
         edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
         lines_drift = None
@@ -357,6 +376,7 @@ class Watch:
             persistent=edges is None or min(edges.block_gains, default=0.0) > 0.0,
             frames=len(self._edge_frames),
             contradicted=contradicted,
+            feigned=feigned,
         )
         return Belief(
             judgement=drift_test.judge(evidence, C_ref, mount.limits, test),

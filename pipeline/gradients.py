@@ -26,6 +26,9 @@ FOCAL_PX = 720.0
 _LARGEST_FOCAL_PX = 900.0
 """Above it the image is shrunk to FOCAL_PX: 0.08 deg per pixel is finer than the edges of a LiDAR."""
 
+_SMALLEST_PX = 8
+"""Sides of the finest level are at least so long: the coarsest then has neighbours to interpolate between."""
+
 _BLUR_PX = 1.2
 """Blur of the grey image before its gradient."""
 
@@ -68,8 +71,8 @@ def gradient_pyramid(image: CameraImage, camera: CameraModel) -> GradientPyramid
     grey = cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY)
     height, width = grey.shape
     shrink = FOCAL_PX / focal if focal > _LARGEST_FOCAL_PX else 1.0
-    if shrink < 1.0:
-        size = (max(8, round(width * shrink)), max(8, round(height * shrink)))
+    size = (max(_SMALLEST_PX, round(width * shrink)), max(_SMALLEST_PX, round(height * shrink)))
+    if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     unit = focal * shrink / FOCAL_PX
     response = _responses(grey.astype(np.float32), unit)

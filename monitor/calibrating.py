@@ -2,7 +2,8 @@
 
 import dataclasses
 import threading
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -14,16 +15,17 @@ from monitor.intake import Intake
 from monitor.messages import Message
 from monitor.model_file import model_bytes
 from monitor.preparation import prepare
-from monitor.rig import load_rig
-from monitor.sources import open_source
+from monitor.refusal import Account, drop_notes, refuse_unusable
+from monitor.rig import Rig, load_rig
+from monitor.sources import Source, open_source
 from monitor.statements import TO_PEOPLE
 from monitor.status import AXIS_NAMES, AxisName, unit_of
 from pipeline import se3
-from pipeline.errors import InputError
+from pipeline.errors import RigError
 from pipeline.parameters import Parameters
-from pipeline.records import Floats
+from pipeline.records import Floats, FramePair
 from pipeline.segmentation import Segmenter
-from pipeline.watch import Mount, Watch
+from pipeline.watch import Findings, Mount, Watch
 
 _ALL_NS = 1 << 62
 """ns; a calibration looks at the whole recording."""
@@ -70,6 +72,7 @@ def calibrate(
     model: Path | None,
     stop: threading.Event,
     progress: Callable[[int], None] | None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Calibration, ...]:
     """Estimates the extrinsic of every pair of a recording.
 
@@ -81,12 +84,13 @@ def calibrate(
         model: The network's file, or None: the one that ships.
         stop: Ends the reading early; what was read counts.
         progress: Told the number of pairs.
+        tell: Told what of the recording was lost or dropped, one sentence each.
 
     Raises:
         CalibwatchError: Recording, rig or model can not be used.
     """
     rig = prepare(location, rig_file, drift).rig
-    truth = {} if reference is None else {pair.name: pair.T_cam_lidar for pair in load_rig(reference).pairs}
+    truth = {} if reference is None else _truth(reference, rig)
     window = dataclasses.replace(
         Parameters().window, longest_ns=_ALL_NS, spacing_ns=_SPACING_NS, least_frames=_NEVER
     )
@@ -94,25 +98,54 @@ def calibrate(
     segmenter = Segmenter(model_bytes(model))
     watches = {pair.name: Watch(mount_of(pair), parameters, segmenter) for pair in rig.pairs}
     intake = Intake(rig)
+    accounts = {
+        name: Account(name, 0, Counter(), watch.mount.camera, None) for name, watch in watches.items()
+    }
     count = 0
     with open_source(location) as source:
-        for message in source:
-            if stop.is_set():
-                break
-            for pair in intake.take(message) if isinstance(message, Message) else ():
-                watches[pair.pair].step(pair)
-                count += 1
-                if progress is not None:
-                    progress(count)
-        for pair in intake.flush():
-            watches[pair.pair].step(pair)
+        for pair in _pairs(source, intake, stop):
+            findings = watches[pair.pair].step(pair)
+            accounts[pair.pair] = _counted(accounts[pair.pair], pair, findings)
             count += 1
-    if count == 0:
-        raise InputError(
-            f"{location}: no sweep and image belong together", hint="calibwatch inspect tells why"
+            if progress is not None:
+                progress(count)
+        if not stop.is_set():
+            refuse_unusable(tuple(accounts.values()), intake, source.losses)
+        for note in (*source.losses.notes, *intake.notes, *drop_notes(tuple(accounts.values()), intake)):
+            tell(note)
+    return tuple(_result(name, watch, truth.get(name), parameters) for name, watch in watches.items())
+
+
+def _truth(reference: Path, rig: Rig) -> dict[str, Floats]:
+    """The extrinsic to compare each pair with; a reference of one pair speaks for a rig of one."""
+    known = {
+        pair.name: pair.T_cam_lidar for pair in load_rig(reference).pairs if pair.T_cam_lidar is not None
+    }
+    if len(known) == len(rig.pairs) == 1:
+        return {rig.pairs[0].name: next(iter(known.values()))}
+    truth = {pair.name: known[pair.name] for pair in rig.pairs if pair.name in known}
+    if not truth:
+        raise RigError(
+            f"{reference} has no T_cam_lidar for pair {' or '.join(pair.name for pair in rig.pairs)}",
+            hint=f"it has: {', '.join(known)}" if known else "give a rig file that states the extrinsic",
         )
-    only = next(iter(truth.values())) if len(truth) == 1 else None
-    return tuple(_result(name, watch, truth.get(name, only), parameters) for name, watch in watches.items())
+    return truth
+
+
+def _pairs(source: Source, intake: Intake, stop: threading.Event) -> Iterator[FramePair]:
+    for message in source:
+        if stop.is_set():
+            return
+        yield from intake.take(message) if isinstance(message, Message) else ()
+    yield from intake.flush()
+
+
+def _counted(account: Account, pair: FramePair, findings: Findings) -> Account:
+    if findings.dropped is None:
+        return dataclasses.replace(account, used=account.used + 2)
+    wrong_size = pair.image.size if findings.dropped == "image_size" else account.wrong_size
+    dropped = account.dropped + Counter({findings.dropped: 2})
+    return dataclasses.replace(account, dropped=dropped, wrong_size=wrong_size)
 
 
 _NEVER = 1 << 30

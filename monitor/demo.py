@@ -70,6 +70,7 @@ def demo(out: Path, seed: int, stop: threading.Event, progress: Callable[[str], 
 
     Raises:
         CalibwatchError: Something in the way: the folder, the disk, the model.
+        KeyboardInterrupt: ``stop`` was set before the drive was there.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -84,11 +85,13 @@ def demo(out: Path, seed: int, stop: threading.Event, progress: Callable[[str], 
         raise InputError(
             f"folder {out} can not be used: {error.strerror}", hint="--out wants a folder"
         ) from error
-    write_drive(
-        demo_drive(seed),
-        recording,
-        progress=lambda done, total: progress(f"simulating frame {done} of {total}"),
-    )
+
+    def simulated(done: int, total: int) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt  # half a drive is worth nothing
+        progress(f"simulating frame {done} of {total}")
+
+    write_drive(demo_drive(seed), recording, progress=simulated)
     summary = replay(
         str(recording),
         rig_file,

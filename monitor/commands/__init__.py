@@ -65,6 +65,10 @@ def verdict_options(function: Callable[..., object]) -> Callable[..., object]:
     )(function)
 
 
+INTERRUPTED = 130
+"""Exit code of a run that SIGINT or SIGTERM ended."""
+
+
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
     """An event that SIGINT and SIGTERM set; the second signal interrupts at once."""

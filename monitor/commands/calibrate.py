@@ -50,12 +50,16 @@ def command(
             model=model,
             stop=stop,
             progress=commands.progress_line("pairs read:"),
+            tell=lambda note: click.echo(f"warning: {note}", err=True),
         )
     if as_json:
         click.echo(json.dumps([result.model_dump(mode="json") for result in results], indent=2))
     else:
         for result in results:
             _tell(result)
+    if stop.is_set():
+        click.echo("interrupted: what came after was not read", err=True)
+        return commands.INTERRUPTED
     return 0 if any(result.observable for result in results) else EXIT_CODES["unobservable"]
 
 

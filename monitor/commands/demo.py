@@ -33,6 +33,8 @@ def command(*, out: Path, seed: int) -> int:
     click.echo(f"report:    {out / 'report.html'} (open in a browser)")
     click.echo(f"recording: {out / 'recording.rrd'} (open with: rerun {out / 'recording.rrd'})")
     click.echo(f"drive:     {out / 'drive.mcap'} (judge it again: calibwatch replay {out / 'drive.mcap'})")
+    if not told.summary.complete:
+        return commands.INTERRUPTED
     return 0 if told.success else 1
 
 

@@ -73,7 +73,7 @@ def command(
     else:
         tell(summary, out, images_hz)
     if not summary.complete:
-        return 130
+        return commands.INTERRUPTED
     return exit_code(summary.state, exit_zero=exit_zero)
 
 

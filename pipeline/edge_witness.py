@@ -104,11 +104,14 @@ class EdgeBatch:
 
     def thinned(self, stride: int) -> "EdgeBatch":
         """Every ``stride``-th edge, the same images."""
-        fewer = {
-            name: getattr(self, name)[::stride]
-            for name in ("position", "direction", "weight", "cell", "slot")
-        }
-        return dataclasses.replace(self, **fewer)
+        return dataclasses.replace(
+            self,
+            position=np.asfortranarray(self.position[::stride]),
+            direction=np.asfortranarray(self.direction[::stride]),
+            weight=self.weight[::stride].copy(),
+            cell=self.cell[::stride],
+            slot=self.slot[::stride].copy(),
+        )
 
 
 def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel, most_edges: int) -> EdgeBatch:
@@ -117,8 +120,9 @@ def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel, most_edges: int) 
     kept = slice(None, None, max(1, -(-total // most_edges)))
     stretches = [int((f.distance_m - frames[0].distance_m) // NEW_SCENE_M) for f in frames]
     return EdgeBatch(
-        position=np.concatenate([f.edges.position for f in frames])[kept],
-        direction=np.concatenate([f.edges.direction for f in frames])[kept],
+        # Coordinate by coordinate in memory: that is how they are worked on, some hundred times.
+        position=np.asfortranarray(np.concatenate([f.edges.position for f in frames])[kept]),
+        direction=np.asfortranarray(np.concatenate([f.edges.direction for f in frames])[kept]),
         weight=np.concatenate([f.edges.weight for f in frames])[kept],
         cell=np.concatenate(
             [f.edges.cell + CELLS * stretch for f, stretch in zip(frames, stretches, strict=True)]
@@ -171,35 +175,54 @@ def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Flo
         Score (weighted mean response), gradient float64 (6,) by (phi, rho) at ``T_cam_lidar``, and float64
         (N,6) whose sum is the gradient. The direction across each edge is held while differentiating.
     """
-    value, point_slope, points = _respond(batch, T_cam_lidar, level)
+    value, by_point, points = _respond(batch, T_cam_lidar, level)
     total = float(batch.weight.sum())
-    w = (batch.weight / total)[:, None]
-    share = np.empty((len(points), 6))
-    # p x s: the slope by a turn about the camera's centre (FORMULAS A2).
+    w = batch.weight / total
+    share = np.empty((6, len(w)))
+    _by_turn(points, by_point, share)
+    share[3:] = by_point
+    share *= w
+    return float(batch.weight @ value) / total, share.sum(axis=1), share.T
+
+
+def _score_and_gradient(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Floats]:
+    """The first two of :func:`score`, for a third less."""
+    value, by_point, points = _respond(batch, T_cam_lidar, level)
+    total = float(batch.weight.sum())
+    turns = _by_turn(points, by_point, np.empty_like(points))
+    return float(batch.weight @ value) / total, np.concatenate(
+        [turns @ batch.weight, by_point @ batch.weight]
+    ) / total
+
+
+def _by_turn(points: Floats, by_point: Floats, out: Floats) -> Floats:
+    """``p x s`` into the first rows of ``out``: the slope by a turn about the camera's centre (A2)."""
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        share[:, k] = points[:, i] * point_slope[:, j] - points[:, j] * point_slope[:, i]
-    share[:, 3:] = point_slope
-    share *= w
-    return float(batch.weight @ value) / total, share.sum(axis=0), share
+        out[k] = points[i] * by_point[j] - points[j] * by_point[i]
+    return out
 
 
 def _respond(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[Floats, Floats, Floats]:
-    """Response (N,) under each edge, its derivative (N,3) by the point, the points (N,3), camera frame."""
+    """Response (N,) under each edge, its derivative (3,N) by the point, the points (3,N), camera frame."""
     R = T_cam_lidar[:3, :3]
-    points = batch.position @ R.T + T_cam_lidar[:3, 3]
-    uv, valid = cameras.project_unbounded(batch.camera, points)
-    seen = np.where(valid[:, None], points, [0.0, 0.0, 1.0])
-    J = cameras.projection_jacobian(batch.camera, seen)
-    turned = batch.direction @ R.T
-    step = np.einsum("nij,nj->ni", J, turned)
-    angle = np.arctan2(step[:, 1], step[:, 0])
-    value, slope = sample(
-        batch.stacks[level], batch.slot, np.where(valid[:, None], uv, 0.0), angle, batch.scales[level]
+    points = R @ batch.position.T + T_cam_lidar[:3, 3:]
+    uv, valid, xy, A = cameras.project_with_slopes(batch.camera, points.T)
+    turned = R @ batch.direction.T
+    # The step along the direction, times the depth: its angle is all that is asked for.
+    step = turned[:2] - xy.T * turned[2]
+    angle = np.arctan2(
+        A[:, 1, 0] * step[0] + A[:, 1, 1] * step[1], A[:, 0, 0] * step[0] + A[:, 0, 1] * step[1]
     )
-    value = np.where(valid, value, 0.0)
-    slope = np.where(valid[:, None], slope, 0.0)
-    return value, np.einsum("ni,nij->nj", slope, J), points
+    value, slope = sample(batch.stacks[level], batch.slot, uv, angle, batch.scales[level])
+    if not valid.all():
+        value, slope = np.where(valid, value, 0.0), np.where(valid[:, None], slope, 0.0)
+    by_point = np.empty_like(points)
+    by_point[0] = slope[:, 0] * A[:, 0, 0] + slope[:, 1] * A[:, 1, 0]
+    by_point[1] = slope[:, 0] * A[:, 0, 1] + slope[:, 1] * A[:, 1, 1]
+    by_point[2] = -(by_point[0] * xy[:, 0] + by_point[1] * xy[:, 1])
+    by_point /= np.where(valid, points[2], 1.0)
+    return value, by_point, points
 
 
 def score_only(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> Floats:
@@ -296,21 +319,15 @@ def _ascend(
 ) -> Floats:
     """Climbs from ``xi`` at one level of the pyramid."""
 
-    def negative(x: Floats) -> tuple[float, Floats, Floats]:
-        s, _, share = score(batch, se3.retract(T_stored, x * UNITS), level)
+    def negative(x: Floats) -> tuple[float, Floats]:
+        s, gradient = _score_and_gradient(batch, se3.retract(T_stored, x * UNITS), level)
         # Gradient by xi at a point away from the reference: retraction composes to first order (A2).
-        return -s, -share.sum(axis=0) * UNITS, share * UNITS
+        return -s, -gradient * UNITS
 
-    start_value, start_gradient, share = negative(xi / UNITS)
-    curvature = _start_curvature(share, batch.weight, -start_value)
-    x = _descend(
-        lambda y: negative(y)[:2],
-        xi / UNITS,
-        (start_value, start_gradient),
-        curvature,
-        parameters.step_limits[level],
-        parameters,
-    )
+    value, gradient, share = score(batch, se3.retract(T_stored, xi), level)
+    curvature = _start_curvature(share * UNITS, batch.weight, value)
+    start = (-value, -gradient * UNITS)
+    x = _descend(negative, xi / UNITS, start, curvature, parameters.step_limits[level], parameters)
     return np.asarray(x * UNITS, dtype=np.float64)
 
 
@@ -387,7 +404,7 @@ def _best_inside(
 
     def cost(x: Floats) -> tuple[float, Floats]:
         xi = x * UNITS
-        s, gradient, _ = score(batch, se3.retract(T_stored, xi), 0)
+        s, gradient = _score_and_gradient(batch, se3.retract(T_stored, xi), 0)
         pull = inverse @ xi
         return (
             -s * scale + _PENALTY * float(xi @ pull),
@@ -408,8 +425,8 @@ def _covariance(batch: EdgeBatch, T: Floats, parameters: EdgeWitnessParameters) 
     for axis in range(6):
         step = np.zeros(6)
         step[axis] = parameters.difference
-        ahead = score(batch, se3.retract(T, step * UNITS), 0)[1] * UNITS
-        behind = score(batch, se3.retract(T, -step * UNITS), 0)[1] * UNITS
+        ahead = _score_and_gradient(batch, se3.retract(T, step * UNITS), 0)[1] * UNITS
+        behind = _score_and_gradient(batch, se3.retract(T, -step * UNITS), 0)[1] * UNITS
         H[axis] = -(ahead - behind) / (2.0 * parameters.difference)
     values, vectors = np.linalg.eigh(0.5 * (H + H.T))
     values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))

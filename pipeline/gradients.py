@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from pipeline.records import CameraImage, CameraModel, Floats
 
 ORIENTATIONS = 4
-"""Steps of 45 degrees: the response is a squared cosine, so linear interpolation between them is close."""
+"""Steps of 45 degrees: the response is a squared cosine, so linear interpolation between them is close. A
+power of two."""
 
 LEVELS = 3
 """Scales per image; each is half of the one before."""
@@ -128,15 +129,16 @@ def sample(
     x_in, y_in = np.clip(x, 0.0, w - 1.001), np.clip(y, 0.0, h - 1.001)
     x0, y0 = x_in.astype(np.int64), y_in.astype(np.int64)
     fx, fy = x_in - x0, y_in - y0
-    turn = np.mod(angle, math.pi) * (ORIENTATIONS / math.pi)
-    o0 = turn.astype(np.int64) % ORIENTATIONS
-    fo = turn - np.floor(turn)
+    turn = angle * (ORIENTATIONS / math.pi)
+    below = np.floor(turn)
+    fo = turn - below
+    o0 = below.astype(np.int64) & (ORIENTATIONS - 1)
+    first = ((slot * ORIENTATIONS + o0) * h + y0) * w + x0
+    second = first + np.where(o0 == ORIENTATIONS - 1, (1 - ORIENTATIONS) * h * w, h * w)
     flat = stack.reshape(-1)
-    taps = np.zeros((4, len(x)))
-    for o, weight in ((o0, 1.0 - fo), ((o0 + 1) % ORIENTATIONS, fo)):
-        base = ((slot * ORIENTATIONS + o) * h + y0) * w + x0
-        for tap, offset in enumerate((0, 1, w, w + 1)):
-            taps[tap] += weight * flat.take(base + offset)
+    taps = np.empty((4, len(x)))
+    for tap, offset in enumerate((0, 1, w, w + 1)):
+        taps[tap] = (1.0 - fo) * flat.take(first + offset) + fo * flat.take(second + offset)
     taps /= COUNTS
     top = taps[0] + fx * (taps[1] - taps[0])
     bottom = taps[2] + fx * (taps[3] - taps[2])

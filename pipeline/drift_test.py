@@ -95,7 +95,7 @@ class Evidence:
         persistent: Whether each part of the window by itself prefers the estimate.
         frames: Frames in the window.
         contradicted: Whether the two witnesses differ by more than their errors allow.
-        feigned: float64 (6,), drift that an error of one sigma in the time between sweep and image would feign:
+        feigned: float64 (6,), drift that one sigma of error in the time between sweep and image would feign:
             forward or sync can not be told apart by one window (FORMULAS G1).
     """
 

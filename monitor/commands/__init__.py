@@ -6,21 +6,25 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from monitor.rig import parse_inject
 from pipeline.errors import CalibwatchError
-from pipeline.records import Floats
+
+if TYPE_CHECKING:
+    from pipeline.records import Floats
 
 
-class DriftParameter(click.ParamType[Floats]):
+class DriftParameter(click.ParamType["Floats"]):
     """``yaw=0.5,up=0.05``: degrees and metres by the six names."""
 
     name = "AXIS=VALUE,..."
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Floats:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> "Floats":
         """Drift (6,), rad and m; a misspelt axis is wrong usage."""
+        from monitor.rig import parse_inject  # noqa: PLC0415 - numpy is not needed for --help
+
         try:
             return parse_inject(str(value))
         except CalibwatchError as error:

@@ -263,7 +263,7 @@ def _paint(
         & (intensity > np.concatenate([np.where(pairs, intensity[1:], -np.inf), [-np.inf]]))
     )
     ends = np.concatenate([starts[1:], [len(xyz)]])
-    borders: list[Floats] = []
+    borders: list[float] = []
     last_end = -1
     for p in peak.tolist():
         if p <= last_end:
@@ -272,15 +272,14 @@ def _paint(
         if strip is None:
             continue
         last_end = strip[1]
-        borders.extend(np.array([p, where]) for where in strip[2:])
+        borders.extend(strip[2:])
     if not borders:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    table = np.array(borders)
-    owner = table[:, 0].astype(np.int64)
-    whole = np.floor(table[:, 1]).astype(np.int64)
-    part = (table[:, 1] - whole)[:, None]
+    place = np.array(borders)
+    whole = np.floor(place).astype(np.int64)
+    part = (place - whole)[:, None]
     nxt = np.minimum(whole + 1, len(xyz) - 1)
-    return (1.0 - part) * xyz[whole] + part * xyz[nxt], tangent[owner]
+    return (1.0 - part) * xyz[whole] + part * xyz[nxt], tangent[whole]
 
 
 def _strip(

@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,11 +248,11 @@ def solve(
         parameters: See there.
         rng: Draws the extrinsics of chance.
     """
-    stored = score(batch, T_stored, 0)[0]
+    stored = score(batch, T_stored, 0)
     xi, best = _best_maximum(batch, T_stored, stored, parameters)
     T_best = se3.retract(T_stored, xi)
     chance, spread = _chance(batch, T_stored, parameters, rng)
-    inside = _best_inside(batch, T_stored, best, floor, parameters)
+    inside = _best_inside(batch, T_stored, (stored, best), floor, parameters)
     at_best = score_only(batch, T_best, 0)
     at_inside = score_only(batch, se3.retract(T_stored, inside), 0)
     penalty = _PENALTY * float(inside @ np.linalg.solve(floor, inside))
@@ -259,7 +260,7 @@ def solve(
         xi=xi,
         covariance=_covariance(batch, T_best, parameters),
         score=best,
-        score_stored=stored,
+        score_stored=stored[0],
         contrast=best / chance - 1.0 if chance > 0 else 0.0,
         peak=(best - chance) / spread if spread > 0 else 0.0,
         loss=max(0.0, 1.0 - float(at_inside.sum() / at_best.sum()) + penalty) if best > 0 else 0.0,
@@ -283,22 +284,25 @@ def _block_gains(slot: NDArray[np.int64], at_best: Floats, at_inside: Floats) ->
     )
 
 
+_Scored: TypeAlias = tuple[float, Floats, Floats]
+"""What :func:`score` gives."""
+
+
 def _best_maximum(
-    batch: EdgeBatch, T_stored: Floats, stored: float, parameters: EdgeWitnessParameters
+    batch: EdgeBatch, T_stored: Floats, stored: _Scored, parameters: EdgeWitnessParameters
 ) -> tuple[Floats, float]:
     """The nearest maximum, unless one that a coarser level leads to scores clearly more."""
-    nearest = _ascend(batch, T_stored, np.zeros(6), 0, parameters)
-    xi, best = np.zeros(6), stored
+    nearest, value = _ascend(batch, T_stored, np.zeros(6), 0, parameters, stored)
+    xi, best = np.zeros(6), stored[0]
     thin = batch.thinned(_COARSE_STRIDE)
     for schedule in ((), (1, 0), (2, 1, 0)):
         candidate = nearest if not schedule else np.zeros(6)
         for level in schedule:
-            candidate = _ascend(thin, T_stored, candidate, level, parameters)
+            candidate, _ = _ascend(thin, T_stored, candidate, level, parameters)
         if schedule and np.linalg.norm((candidate - nearest) / UNITS) < _SAME_MODE:
             continue
         if schedule:
-            candidate = _ascend(batch, T_stored, candidate, 0, parameters)
-        value = score(batch, se3.retract(T_stored, candidate), 0)[0]
+            candidate, value = _ascend(batch, T_stored, candidate, 0, parameters)
         far = float(np.linalg.norm(candidate[:3])) > parameters.farthest_rad
         far = far or float(np.linalg.norm(candidate[3:])) > parameters.farthest_m
         wanted = best * (1.0 + parameters.least_gain) if schedule else best
@@ -315,20 +319,25 @@ _SAME_MODE = 1.0
 
 
 def _ascend(
-    batch: EdgeBatch, T_stored: Floats, xi: Floats, level: int, parameters: EdgeWitnessParameters
-) -> Floats:
-    """Climbs from ``xi`` at one level of the pyramid."""
+    batch: EdgeBatch,
+    T_stored: Floats,
+    xi: Floats,
+    level: int,
+    parameters: EdgeWitnessParameters,
+    scored: _Scored | None = None,
+) -> tuple[Floats, float]:
+    """The top reached from ``xi``, whose score may be known, at one level of the pyramid; its score."""
 
     def negative(x: Floats) -> tuple[float, Floats]:
         s, gradient = _score_and_gradient(batch, se3.retract(T_stored, x * UNITS), level)
         # Gradient by xi at a point away from the reference: retraction composes to first order (A2).
         return -s, -gradient * UNITS
 
-    value, gradient, share = score(batch, se3.retract(T_stored, xi), level)
+    value, gradient, share = scored or score(batch, se3.retract(T_stored, xi), level)
     curvature = _start_curvature(share * UNITS, batch.weight, value)
     start = (-value, -gradient * UNITS)
-    x = _descend(negative, xi / UNITS, start, curvature, parameters.step_limits[level], parameters)
-    return np.asarray(x * UNITS, dtype=np.float64)
+    x, least = _descend(negative, xi / UNITS, start, curvature, parameters.step_limits[level], parameters)
+    return np.asarray(x * UNITS, dtype=np.float64), -least
 
 
 def _start_curvature(share: Floats, weight: Floats, value: float) -> Floats:
@@ -346,8 +355,8 @@ def _descend(
     B: Floats,
     radius: float,
     parameters: EdgeWitnessParameters,
-) -> Floats:
-    """Minimises by trust-region BFGS in alert units: steps stay inside the basin that the blur makes."""
+) -> tuple[Floats, float]:
+    """The minimum and its value by trust-region BFGS in alert units: steps stay inside the blur's basin."""
     value, gradient = start
     limit = radius
     for _ in range(parameters.most_steps):
@@ -366,7 +375,7 @@ def _descend(
         if ratio > _ACCEPT:
             x, value, gradient = x + step, new_value, new_gradient
         radius = 0.5 * length if ratio < _SHRINK else min(limit, max(radius, 2.0 * length))
-    return x
+    return x, value
 
 
 _ACCEPT, _SHRINK = 1e-4, 0.25
@@ -382,9 +391,11 @@ def _trust_region_step(B: Floats, gradient: Floats, radius: float) -> Floats:
     if np.linalg.norm(step) <= radius:
         return np.asarray(vectors @ step, dtype=np.float64)
     low, high = 0.0, float(np.linalg.norm(g)) / radius
+    # Plain numbers: six of them are too few for numpy.
+    terms = list(zip(np.square(g).tolist(), values.tolist(), strict=True))
     for _ in range(40):
         middle = 0.5 * (low + high)
-        if np.linalg.norm(g / (values + middle)) > radius:
+        if sum(square / (value + middle) ** 2 for square, value in terms) > radius * radius:
             low = middle
         else:
             high = middle
@@ -396,9 +407,17 @@ _PENALTY = 0.004
 
 
 def _best_inside(
-    batch: EdgeBatch, T_stored: Floats, best: float, floor: Floats, parameters: EdgeWitnessParameters
+    batch: EdgeBatch,
+    T_stored: Floats,
+    scores: tuple[_Scored, float],
+    floor: Floats,
+    parameters: EdgeWitnessParameters,
 ) -> Floats:
-    """The best xi when leaving the stored extrinsic costs by the floor: what needs no drift to explain it."""
+    """The best xi when leaving the stored extrinsic costs by the floor: what needs no drift to explain it.
+
+    ``scores`` are those at the stored extrinsic and at the maximum.
+    """
+    (stored, gradient, share), best = scores
     inverse = np.linalg.inv(floor)
     scale = 1.0 / max(best, 1e-9)
 
@@ -411,11 +430,10 @@ def _best_inside(
             (-gradient * scale + 2.0 * _PENALTY * pull) * UNITS,
         )
 
-    x0 = np.zeros(6)
-    _, _, share = score(batch, T_stored, 0)
     B = _start_curvature(share * UNITS, batch.weight, best) * scale
     B = B + 2.0 * _PENALTY * (UNITS[:, None] * inverse * UNITS[None, :])
-    found = _descend(cost, x0, cost(x0), B, parameters.step_limits[0], parameters)
+    start = (-stored * scale, -gradient * scale * UNITS)
+    found, _ = _descend(cost, np.zeros(6), start, B, parameters.step_limits[0], parameters)
     return np.asarray(found * UNITS, dtype=np.float64)
 
 
@@ -432,9 +450,8 @@ def _covariance(batch: EdgeBatch, T: Floats, parameters: EdgeWitnessParameters) 
     values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
     H_inverse = (vectors / values) @ vectors.T
     share = score(batch, T, 0)[2] * UNITS
-    cells = np.zeros((int(batch.cell.max()) + 1, 6))
-    np.add.at(cells, batch.cell, share)
-    G = cells.T @ cells
+    cells = np.stack([np.bincount(batch.cell, weights=column) for column in share.T])
+    G = cells @ cells.T
     C = H_inverse @ G @ H_inverse * parameters.sigma_factor**2
     # A direction that no cell pulls on has no stated error; the floor of H alone bounds it.
     C = C + 1e-8 * np.eye(6)

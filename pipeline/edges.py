@@ -6,6 +6,7 @@ depend on the sensor (steps along and between rings, noise of the intensity) com
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline import cameras
 from pipeline.ground import Ground
+from pipeline.medians import median
 from pipeline.records import CameraModel, Floats, PointCloud, read_only
 from pipeline.rings import ScanPattern, scan_pattern
 
@@ -119,7 +121,8 @@ def find_edges(
     if pattern is None:
         return None
     xyz = cloud.xyz[pattern.index].astype(np.float64)
-    tangent = np.column_stack([-np.sin(_true_azimuth(xyz)), np.cos(_true_azimuth(xyz)), np.zeros(len(xyz))])
+    azimuth = _true_azimuth(xyz)
+    tangent = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(xyz))])
     found = [_ring_jumps(xyz, tangent, pattern, parameters)]
     if ground is not None:
         found.append(_jumps_between_rings(xyz, pattern, ground, parameters))
@@ -152,6 +155,7 @@ _WIDEST_SLOPE = 5.0
 """Slope of the steepest ray that is looked at (79 deg off axis), for lenses that see more."""
 
 
+@lru_cache(maxsize=16)
 def _border_rays(camera: CameraModel) -> tuple[float, float, float, float]:
     """Slopes x/z and y/z of the border of the image: left, right, top, bottom, with the margin."""
     u = np.linspace(0.0, camera.width - 1.0, 17)
@@ -245,10 +249,8 @@ def _paint(
         np.diff(pattern.azimuth) < parameters.gap_steps * pattern.azimuth_step
     )
     pairs = beside & on_ground[1:] & on_ground[:-1]
-    noise = (
-        1.48 * float(np.median(np.abs(np.diff(intensity)[pairs]))) / math.sqrt(2.0) if pairs.any() else 0.0
-    )
-    road = float(np.median(intensity[on_ground]))
+    noise = 1.48 * median(np.abs(np.diff(intensity)[pairs])) / math.sqrt(2.0) if pairs.any() else 0.0
+    road = median(intensity[on_ground])
     least = max(parameters.paint_noise * noise, parameters.paint_contrast * road)
     # Stretches of ground along one ring without a gap; strips are sought inside each.
     starts = np.flatnonzero(np.concatenate([[True], ~pairs]))
@@ -263,12 +265,15 @@ def _paint(
         & (intensity > np.concatenate([np.where(pairs, intensity[1:], -np.inf), [-np.inf]]))
     )
     ends = np.concatenate([starts[1:], [len(xyz)]])
+    reach = parameters.strip_widest_m + parameters.background_m
+    first = np.maximum(starts[stretch[peak]], np.searchsorted(along, along[peak] - reach))
+    last = np.minimum(ends[stretch[peak]], np.searchsorted(along, along[peak] + reach))
     borders: list[float] = []
     last_end = -1
-    for p in peak.tolist():
+    for p, a, b in zip(peak.tolist(), first.tolist(), last.tolist(), strict=True):
         if p <= last_end:
             continue
-        strip = _strip(along, intensity, p, int(starts[stretch[p]]), int(ends[stretch[p]]), least, parameters)
+        strip = _strip(along, intensity, p, a, b, least, parameters)
         if strip is None:
             continue
         last_end = strip[1]
@@ -283,52 +288,56 @@ def _paint(
 
 
 def _strip(
-    along: Floats, intensity: Floats, p: int, start: int, end: int, least: float, parameters: EdgeParameters
+    along: Floats, intensity: Floats, p: int, a: int, b: int, least: float, parameters: EdgeParameters
 ) -> tuple[int, int, float, float] | None:
-    """The strip around a peak: ends of its half level, and its two borders as fractional indices."""
-    reach = parameters.strip_widest_m + parameters.background_m
-    a = max(start, int(np.searchsorted(along, along[p] - reach)))
-    b = min(end, int(np.searchsorted(along, along[p] + reach)))
+    """The strip around a peak between indices a and b: ends of its half level, and its two borders.
+
+    The borders are fractional indices.
+    """
     values, where = intensity[a:b], along[a:b] - along[p]
     level = float(intensity[p])
     outside = np.abs(where) > 0.5 * parameters.strip_widest_m
     if not outside.any():
         return None
     # First guess of the road from beyond the widest strip, then the half level, then each side's own road.
-    floor = float(np.median(values[outside]))
-    half = 0.5 * (level + floor)
+    half = 0.5 * (level + median(values[outside]))
     below = values < half
     k = p - a
-    left, right = np.flatnonzero(below[:k]), np.flatnonzero(below[k + 1 :])
+    left, right = below[:k].nonzero()[0], below[k + 1 :].nonzero()[0]
     if left.size == 0 or right.size == 0:
         return None
     i, j = int(left[-1]), k + 1 + int(right[0])
-    width = float(where[j - 1] - where[i + 1])
-    if not (j - i > 2 or width >= 0.0) or width > parameters.strip_widest_m:
+    begin, end = float(where[i + 1]), float(where[j - 1])
+    if not (j - i > 2 or end >= begin) or end - begin > parameters.strip_widest_m:
         return None
-    left_road = values[(where < where[i + 1]) & (where > where[i + 1] - parameters.background_m)]
-    right_road = values[(where > where[j - 1]) & (where < where[j - 1] + parameters.background_m)]
+    left_road = values[(where < begin) & (where > begin - parameters.background_m)]
+    right_road = values[(where > end) & (where < end + parameters.background_m)]
     if left_road.size < 2 or right_road.size < 2:
         return None
-    low_left, low_right = float(left_road.mean()), float(right_road.mean())
+    low_left = float(np.add.reduce(left_road)) / left_road.size
+    low_right = float(np.add.reduce(right_road)) / right_road.size
     rise = level - 0.5 * (low_left + low_right)
     if rise < least or abs(low_left - low_right) > parameters.paint_asymmetry * rise:
         return None
-    half_left, half_right = 0.5 * (level + low_left), 0.5 * (level + low_right)
-    border_left = _crossing(values, i, i + 1, half_left)
-    border_right = _crossing(values, j - 1, j, half_right)
-    span = float(
-        np.interp(border_right, np.arange(len(where)), where)
-        - np.interp(border_left, np.arange(len(where)), where)
-    )
+    border_left = _crossing(values, i, i + 1, 0.5 * (level + low_left))
+    border_right = _crossing(values, j - 1, j, 0.5 * (level + low_right))
+    span = _between(where, border_right) - _between(where, border_left)
     wide = span >= parameters.strip_narrowest_m
     return (a + i, a + j, a + border_left, a + border_right) if wide else None
 
 
+def _between(values: Floats, place: float) -> float:
+    """The value at a fractional index inside the array."""
+    whole = int(place)
+    below, above = float(values[whole]), float(values[min(whole + 1, len(values) - 1)])
+    return below + (place - whole) * (above - below)
+
+
 def _crossing(values: Floats, i: int, j: int, level: float) -> float:
     """Fractional index between neighbours i and j at which the values pass ``level``."""
-    rise = float(values[j] - values[i])
-    return i + float(np.clip((level - values[i]) / rise, 0.0, 1.0)) if rise != 0.0 else float(i)
+    low = float(values[i])
+    rise = float(values[j]) - low
+    return i + min(max((level - low) / rise, 0.0), 1.0) if rise != 0.0 else float(i)
 
 
 def _thinned(

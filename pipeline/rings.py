@@ -4,7 +4,6 @@ Nothing is set per sensor. A ring number in the cloud is used where there is one
 order of the points (ring after ring) or off their elevation. A cloud without any such pattern gives None.
 """
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import se3
+from pipeline.medians import group_medians, grouped, median
 from pipeline.records import Floats, PointCloud
 
 _FEWEST_RINGS, _MOST_RINGS = 4, 512
@@ -96,7 +96,7 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
     rank, azimuth = rank[order], azimuth[order]
     step = np.diff(azimuth)[np.diff(rank) == 0]
     step = step[step > _LEAST_STEP_RAD]
-    medians = _medians(elevation[order], rank)
+    medians = group_medians(elevation[order], rank, int(rank[-1]) + 1)
     spacing = np.diff(medians)
     if step.size == 0 or spacing.size == 0:
         return None
@@ -106,8 +106,8 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
         azimuth=azimuth,
         elevation=elevation[order],
         distance=np.hypot(flat, xyz[:, 2])[order],
-        azimuth_step=float(np.median(step)),
-        ring_spacing=float(np.median(spacing)),
+        azimuth_step=median(step),
+        ring_spacing=median(spacing),
     )
 
 
@@ -117,9 +117,11 @@ def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
         return cloud.ring.astype(np.int64)
     if len(cloud) < _FEWEST_RINGS:
         return None
-    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0]).astype(np.float64)
-    elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])).astype(np.float64)
-    by_order = _rings_by_order(azimuth, elevation, np.linalg.norm(cloud.xyz, axis=1).astype(np.float64))
+    x, y, z = np.ascontiguousarray(cloud.xyz.T)
+    azimuth = np.arctan2(y, x).astype(np.float64)
+    elevation = np.arctan2(z, np.hypot(x, y)).astype(np.float64)
+    distance = np.sqrt(x * x + y * y + z * z).astype(np.float64)
+    by_order = _rings_by_order(azimuth, elevation, distance)
     if by_order is not None and _believable(by_order, elevation):
         return by_order
     by_elevation = _rings_by_elevation(elevation)
@@ -130,9 +132,10 @@ def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
 
 def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDArray[np.int64] | None:
     """Ring number where the file holds ring after ring: each turn of the azimuth begins a new one."""
-    step = np.mod(np.diff(azimuth) + math.pi, 2.0 * math.pi) - math.pi
-    sense = math.copysign(1.0, float(np.median(step)))
-    step = step * sense
+    step = _wrapped(np.diff(azimuth))
+    middle = median(step)
+    sense = math.copysign(1.0, middle)
+    step *= sense
     # Ring after ring means small steps forward nearly always; column after column does not.
     if float(np.mean((step > -_STEP_NOISE_RAD) & (step < math.radians(5.0)))) < 1.0 - _RING_STRAYS:
         return None
@@ -148,7 +151,7 @@ def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDA
     ring = np.floor(turns).astype(np.int64)
     ring -= ring[0]
     # Where a ring ends a point's ring is not sure, and no edge may be seen between it and the next.
-    unsure = np.abs(turns - np.rint(turns)) * 2.0 * math.pi < 2.0 * float(np.median(step))
+    unsure = np.abs(turns - np.rint(turns)) * 2.0 * math.pi < 2.0 * abs(middle)
     return np.where(unsure, -1, ring)
 
 
@@ -168,10 +171,15 @@ def _seam(
         azimuth[1:][jumps], bins=_SEAM_BINS, range=(0.0, 2.0 * math.pi), weights=change[jumps]
     )
     best = int(np.argmax(np.abs(sums + np.roll(sums, 1) + np.roll(sums, -1))))
-    offset = np.mod(azimuth[1:] - borders[best] + math.pi, 2.0 * math.pi) - math.pi
-    near = jumps & (np.abs(offset) < 2.0 * (borders[1] - borders[0]))
-    seam = borders[best] + (np.median(offset[near]) if near.any() else 0.0)
+    offset = _wrapped(azimuth[1:][jumps] - borders[best])
+    near = offset[np.abs(offset) < 2.0 * (borders[1] - borders[0])]
+    seam = borders[best] + (median(near) if near.size else 0.0)
     return float(np.mod(seam - 0.5 * _empty_before(azimuth, best), 2.0 * math.pi))
+
+
+def _wrapped(angle: Floats) -> Floats:
+    """Angles (N,) less whole turns, in -pi..pi."""
+    return np.asarray(angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi)))
 
 
 def _empty_before(azimuth: Floats, seam_bin: int) -> float:
@@ -179,7 +187,8 @@ def _empty_before(azimuth: Floats, seam_bin: int) -> float:
 
     In a sweep that was cut there, the first points of the rings lie along the cut and not at one azimuth.
     """
-    empty = np.histogram(azimuth, bins=_SEAM_BINS, range=(0.0, 2.0 * math.pi))[0] == 0
+    place = (azimuth * (_SEAM_BINS / (2.0 * math.pi))).astype(np.int64)
+    empty = np.bincount(np.minimum(place, _SEAM_BINS - 1), minlength=_SEAM_BINS) == 0
     before = np.roll(empty, _SEAM_BINS - seam_bin - 1)[::-1]
     # The cut may pass through the bin of the seam, or one beside it.
     first = int(np.argmax(before[:3]))
@@ -208,10 +217,10 @@ def _believable(ring: NDArray[np.int64], elevation: Floats) -> bool:
     """
     sure = ring >= 0
     ring, elevation = ring[sure], elevation[sure]
-    order = np.argsort(ring, kind="stable")
-    medians = _medians(elevation[order], ring[order])
+    order = grouped(ring)
+    medians = group_medians(elevation[order], ring[order], int(ring.max()) + 1)
+    own = median(np.abs(elevation - medians[ring]))
     medians = medians[np.isfinite(medians)]
-    own = np.median(np.abs(elevation - _medians(elevation[order], ring[order])[ring]))
     return bool(own < _OWN_SHARE * np.ptp(medians) and len(medians) >= _FEWEST_RINGS)
 
 
@@ -222,30 +231,24 @@ def _sharp(ring: NDArray[np.int64], elevation: Floats) -> bool:
     """
     sure = ring >= 0
     ring, elevation = ring[sure], elevation[sure]
-    order = np.argsort(ring, kind="stable")
-    medians = _medians(elevation[order], ring[order])
-    off = float(np.median(np.abs(elevation - medians[ring])))
+    order = grouped(ring)
+    medians = group_medians(elevation[order], ring[order], int(ring.max()) + 1)
+    off = median(np.abs(elevation - medians[ring]))
     counts = np.bincount(ring)
     if np.median(counts[counts > 0]) < _RING_POINTS or np.isfinite(medians).sum() < _FEWEST_RINGS:
         return False
     return off < _SHARP_SHARE * float(np.median(np.diff(medians[np.isfinite(medians)])))
 
 
-def _medians(values: Floats, group: NDArray[np.int64], count: int | None = None) -> Floats:
-    """Median of ``values`` for each group number; ``group`` is sorted. NaN for a number that is absent."""
-    size = int(group[-1]) + 1 if count is None else count
-    starts = np.searchsorted(group, np.arange(size + 1))
-    return np.array([np.median(values[a:b]) if b > a else np.nan for a, b in itertools.pairwise(starts)])
-
-
 def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> NDArray[np.int64]:
     """Ring numbers replaced by their rank from the lowest ring up, whatever the sensor's own order."""
-    names, inverse = np.unique(ring, return_inverse=True)
-    order = np.argsort(inverse, kind="stable")
-    medians = _medians(elevation[order], inverse[order], len(names))
-    rank = np.empty(len(names), dtype=np.int64)
-    rank[np.argsort(medians)] = np.arange(len(names))
-    return rank[inverse]
+    order = grouped(ring)
+    numbers = int(ring.max()) + 1
+    # Numbers that are absent have no median; they are sorted to the end and name no point.
+    medians = group_medians(elevation[order], ring[order], numbers)
+    rank = np.empty(numbers, dtype=np.int64)
+    rank[np.argsort(medians)] = np.arange(numbers)
+    return rank[ring]
 
 
 def sensor_frame(T_frame_sensor: Floats, cloud: PointCloud) -> PointCloud:

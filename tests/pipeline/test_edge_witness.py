@@ -234,6 +234,43 @@ def test_edges_behind_the_camera_score_nothing():
     np.testing.assert_array_equal(gradient, 0)
 
 
+LENSES = [
+    ("pinhole", []),
+    ("plumb_bob", [-0.4, 0.2, 0.01, 0.01, -0.1]),
+    ("rational_polynomial", [0.1, -0.2, 0, 0, 0, -0.9, 0.5, 0.1]),
+    ("equidistant", [-0.1, 0.05, 0, 0]),
+]
+
+
+@pytest.mark.parametrize(("model", "D"), LENSES)
+def test_edges_at_and_around_the_centre_of_the_camera_give_finite_scores(model, D):
+    camera = dataclasses.replace(SMALL, model=model, D=np.array(D, float))
+    odd = [
+        [0, 0, 0],
+        [1, 0, 0],
+        [0, 0, 1e-12],
+        [1e9, 0, 1e-3],
+        [0, 1, -1],
+        [1e9, 1e9, 1e9],
+        [3, 3, 1],
+        [0, 0, 5],
+    ]
+    count = len(odd)
+    edges = Edges(
+        np.array(odd, float),
+        np.tile([0.0, 0, 1], (count, 1)),
+        np.zeros(count, np.uint8),
+        np.ones(count),
+        np.arange(count),
+    )
+    batch = batch_of([EdgeFrame(0, edges, wide_pyramid(1))], camera, 100)
+    for level in range(LEVELS):
+        total, gradient, share = score(batch, np.eye(4), level)
+        assert math.isfinite(total)
+        assert np.isfinite(gradient).all()
+        assert np.isfinite(share).all()
+
+
 def test_a_batch_joins_frames_and_thins_them_evenly(window):
     frames, camera, _ = window
     far = [dataclasses.replace(f, distance_m=d) for f, d in zip(frames, (0.0, 100.0, 100.5), strict=True)]

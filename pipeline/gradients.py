@@ -79,9 +79,12 @@ def gradient_pyramid(image: CameraImage, camera: CameraModel) -> GradientPyramid
     response = _responses(grey.astype(np.float32), unit)
     levels, scales = [], []
     for _ in range(LEVELS):
-        blurred = [cv2.GaussianBlur(r, (0, 0), _LEVEL_BLUR_PX * unit) for r in response]
-        levels.append(np.stack([(b * COUNTS).astype(np.uint16) for b in blurred]))
         h, w = response[0].shape[:2]
+        level = np.empty((ORIENTATIONS, h, w), dtype=np.uint16)
+        for counts, r in zip(level, response, strict=True):
+            blurred = cv2.GaussianBlur(r, (0, 0), _LEVEL_BLUR_PX * unit)
+            np.multiply(blurred, np.float32(COUNTS), out=counts, casting="unsafe")
+        levels.append(level)
         scales.append((w / width, h / height))
         half = (max(2, w // 2), max(2, h // 2))
         response = [
@@ -96,14 +99,23 @@ def _responses(grey: NDArray[np.float32], unit: float) -> list[NDArray[np.float3
     gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1.0 / 8.0), dtype=np.float32)
     gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1.0 / 8.0), dtype=np.float32)
     box = max(3, round(_NEIGHBOURHOOD_PX * unit))
-    norm = cv2.blur(cv2.magnitude(gx, gy), (box, box)) + np.float32(_NOISE_FLOOR)
+    # Not by cv2.magnitude, whose last digit depends on where the arrays lie in memory.
+    length = np.square(gx)
+    length += np.square(gy)
+    norm = np.asarray(cv2.blur(np.sqrt(length, out=length), (box, box)), dtype=np.float32)
+    norm += np.float32(_NOISE_FLOOR)
     gx /= norm
     gy /= norm
     found = []
     for k in range(ORIENTATIONS):
         c, s = math.cos(k * math.pi / ORIENTATIONS), math.sin(k * math.pi / ORIENTATIONS)
-        squared = np.square(np.float32(c) * gx + np.float32(s) * gy)
-        found.append(np.asarray(_FULL_SCALE * squared / (squared + _SATURATION), dtype=np.float32))
+        along = np.float32(c) * gx
+        along += np.float32(s) * gy
+        squared = np.square(along, out=along)
+        response = np.float32(_FULL_SCALE) * squared
+        squared += np.float32(_SATURATION)
+        response /= squared
+        found.append(response)
     return found
 
 

@@ -4,6 +4,7 @@ Each edge is a point on the border as the camera sees it, with the direction acr
 depend on the sensor (steps along and between rings, noise of the intensity) come from the cloud itself.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,11 +13,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import cameras
+from pipeline import cameras, se3
 from pipeline.ground import Ground
 from pipeline.medians import median
 from pipeline.records import CameraModel, Floats, PointCloud, read_only
-from pipeline.rings import ScanPattern, scan_pattern
+from pipeline.rings import ScanPattern, scan_pattern, spin_turns
 
 RING_JUMP, BETWEEN_RINGS, PAINT = 0, 1, 2
 """Kinds of edges."""
@@ -117,6 +118,30 @@ def find_edges(
     parameters: EdgeParameters,
 ) -> Edges | None:
     """Edges of the cloud that fall into the image or just beside it; None where the cloud shows no rings."""
+    for turn in spin_turns(cloud):
+        if np.array_equal(turn, np.eye(3)):
+            found = _about_z(cloud, ground, camera, T_cam_lidar, parameters)
+        else:
+            T_back = se3.transform(turn.T, np.zeros(3))
+            turned = dataclasses.replace(cloud, xyz=(cloud.xyz @ turn.T).astype(np.float32))
+            plane = None if ground is None else dataclasses.replace(ground, normal=turn @ ground.normal)
+            found = _about_z(turned, plane, camera, T_cam_lidar @ T_back, parameters)
+            if found is not None:
+                position, direction = found.position @ turn, found.direction @ turn
+                found = dataclasses.replace(found, position=position, direction=direction)
+        if found is not None:
+            return found
+    return None
+
+
+def _about_z(
+    cloud: PointCloud,
+    ground: Ground | None,
+    camera: CameraModel,
+    T_cam_lidar: Floats,
+    parameters: EdgeParameters,
+) -> Edges | None:
+    """The edges of a sensor that spins about the z axis of its cloud."""
     pattern = scan_pattern(cloud, _in_view(cloud, camera, T_cam_lidar))
     if pattern is None:
         return None

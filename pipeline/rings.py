@@ -49,6 +49,23 @@ _ELEVATION_BIN_RAD = math.radians(0.02)
 """Bin of the elevation histogram; a tenth of the closest ring spacing on sale."""
 
 
+_AXIS_POINTS = 6000
+"""Points that are asked for the spin axis: a hundred a ring."""
+
+_AXIS_SHARE = 0.3
+"""Share of the strays about z that those about another axis must stay below."""
+
+_TURNS = (
+    np.eye(3),
+    np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+)
+"""Rotations that bring z, x and y to z."""
+
+_TURN_OF = (1, 2, 0)
+"""Which of them brings axis 0, 1, 2 to z."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPattern:
     """Points ordered by ring from the lowest to the highest, and along each ring by azimuth.
@@ -70,6 +87,27 @@ class ScanPattern:
     distance: Floats
     azimuth_step: float
     ring_spacing: float
+
+
+def spin_turns(cloud: PointCloud) -> tuple[Floats, ...]:
+    """Rotations (3,3) that may bring the spin axis of the sensor to z, the likeliest first.
+
+    Messages name their axes as they like. Where rings are numbered, the spin axis is the one about which a
+    ring keeps its elevation; else z is tried before the others.
+    """
+    if cloud.ring is None or len(cloud) == 0 or int(cloud.ring.max()) == 0:
+        return _TURNS
+    few = slice(None, None, max(1, len(cloud) // _AXIS_POINTS))
+    xyz, ring = cloud.xyz[few].astype(np.float64), cloud.ring[few].astype(np.int64)
+    order = np.argsort(ring, kind="stable")
+    ring = np.unique(ring[order], return_inverse=True)[1]
+    slope = xyz[order] / np.maximum(np.linalg.norm(xyz[order], axis=1), 1e-9)[:, None]
+    count = int(ring[-1]) + 1
+    strays = [median(np.abs(s - group_medians(s, ring, count)[ring])) for s in slope.T]
+    other = int(np.argmin(strays))
+    # A sweep brought to one instant strays a little; only a much better axis is another one.
+    elsewhere = strays[other] < _AXIS_SHARE * strays[2]
+    return (_TURNS[_TURN_OF[other] if elsewhere else 0],)
 
 
 def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | None:

@@ -274,6 +274,22 @@ def test_a_lidar_that_is_turned_about_its_axis_sees_the_same_edges(scene, degree
     same(found_in(scene, flat(len(scene))), other, T)
 
 
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize("degrees", [90, -90])
+@pytest.mark.parametrize("named", [True, False])
+def test_axes_of_the_message_are_named_as_it_likes(scene, axis, degrees, named):
+    R = np.round(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+    T = se3.transform(R, np.zeros(3))
+    # Without numbers rings are told by their elevations, from points in firing order.
+    order = np.lexsort((scene.ring, np.arctan2(scene.xyz[:, 1], scene.xyz[:, 0])))
+    plain = PointCloud(scene.xyz[order], scene.intensity[order], scene.ring[order] if named else None)
+    turned = dataclasses.replace(plain, xyz=se3.apply(T, plain.xyz).astype(np.float32))
+    ground = Ground(R @ [0.0, 0.0, 1.0], HEIGHT, np.ones(len(scene), dtype=bool))
+    a, b = found_in(plain, flat(len(scene))), found_in(turned, ground, T_CAM @ se3.inverse(T))
+    assert len(a) > 200
+    same(a, b, T)
+
+
 def test_a_lidar_that_hangs_upside_down_sees_the_same_edges(scene):
     T = se3.transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     hanging = dataclasses.replace(scene, xyz=se3.apply(T, scene.xyz).astype(np.float32))

@@ -139,10 +139,11 @@ def test_the_same_frames_give_the_same_verdict(yawed):
     assert again.memory.reason == watch.memory.reason
 
 
-def test_a_lidar_turned_by_90_degrees_tells_the_same_drift(yawed):
+@pytest.mark.parametrize("axis", ["z", "x"])
+def test_a_lidar_turned_by_90_degrees_tells_the_same_drift(yawed, axis):
     watch, _, drift = yawed
     parameters, pairs = simulated()
-    turn = se3.transform(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.zeros(3))
+    turn = se3.transform(Rotation.from_euler(axis, 90, degrees=True).as_matrix(), np.zeros(3))
     other, states = watched(mount_of(parameters, drift, turn), turned_pairs(pairs, turn))
     check_told(other, states, 2, drift)
     off = np.abs(other.belief.judgement.drift - watch.belief.judgement.drift)

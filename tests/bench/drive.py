@@ -1,0 +1,33 @@
+"""The drive that is measured: simulated, 64 rings of 1900 columns, 1242x375 px; kept between runs."""
+
+import hashlib
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import pipeline.simulation
+from monitor.simulated_recording import write_drive
+from pipeline.records import CameraModel
+from pipeline.simulation.drive import DriveParameters
+from pipeline.simulation.lidar import spinning
+
+_SECONDS = 3.2
+"""s; the window of 20 frames is full after two."""
+
+
+def simulated() -> Path:
+    """The recording, written on the first call and whenever the simulation has changed."""
+    sources = sorted(Path(next(iter(pipeline.simulation.__path__))).glob("*.py"))
+    sources.append(Path(__file__))
+    version = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12]
+    folder = Path(tempfile.gettempdir()) / "calibwatch-bench"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"simulated-{version}.mcap"
+    if not path.exists():
+        sys.stderr.write(f"simulating {path}\n")
+        K = np.array([[720.0, 0.0, 609.5], [0.0, 720.0, 172.5], [0.0, 0.0, 1.0]])
+        camera = CameraModel("pinhole", K, np.zeros(0), 1242, 375)
+        write_drive(DriveParameters(seed=7, duration=_SECONDS, lidar=spinning(64, 1900), camera=camera), path)
+    return path

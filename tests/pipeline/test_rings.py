@@ -98,7 +98,7 @@ def test_a_sensor_turned_about_its_axis_has_the_same_pattern(cloud, degrees):
     assert a.azimuth_step == pytest.approx(b.azimuth_step, rel=1e-3)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.floats(-math.pi, math.pi), st.sampled_from([1, -1]), st.booleans())
 def test_rings_from_the_order_of_a_file(street, seam, sense, downwards):
     cloud = street.cloud

@@ -41,6 +41,8 @@ class EdgeParameters:
         jump_share: The same as a share of the nearer range: noise and slant grow with range.
         jump_up_m: Smallest jump to the ring above, m.
         jump_up_share: The same as a share: the road itself recedes from ring to ring.
+        sparsest_rad: With rings further apart, jumps between them are left out: where in the gap the edge lies
+            is not known, and half of this gap is three times the blur of the image.
         above_ground_m: The nearer point of a jump to the ring above stands at least so high, m.
         gap_steps: A gap along the ring of more azimuth steps breaks it: what lies there was not seen.
         inset: How far an edge lies from the nearer point towards the farther ray, in steps: between the two,
@@ -63,6 +65,7 @@ class EdgeParameters:
     jump_share: float = 0.06
     jump_up_m: float = 1.0
     jump_up_share: float = 0.15
+    sparsest_rad: float = math.radians(0.8)
     above_ground_m: float = 0.4
     gap_steps: float = 2.6
     inset: float = 0.45
@@ -235,6 +238,8 @@ def _jumps_between_rings(
     xyz: Floats, pattern: ScanPattern, ground: Ground, parameters: EdgeParameters
 ) -> tuple[Floats, Floats]:
     """Kind 1: a point above the ground beside which the ring above sees much farther, moved half a gap up."""
+    if pattern.ring_spacing > parameters.sparsest_rad:
+        return np.zeros((0, 3)), np.zeros((0, 3))
     upward = 1 if ground.normal[2] >= 0 else -1
     turn = 4.0 * math.pi
     key = pattern.ring * turn + pattern.azimuth

@@ -41,8 +41,8 @@ class EdgeParameters:
         jump_share: The same as a share of the nearer range: noise and slant grow with range.
         jump_up_m: Smallest jump to the ring above, m.
         jump_up_share: The same as a share: the road itself recedes from ring to ring.
-        sparsest_rad: With rings further apart, jumps between them are left out: where in the gap the edge lies
-            is not known, and half of this gap is three times the blur of the image.
+        sparsest_rad: With rings further apart, jumps between them are left out: where in the gap the edge is
+            lies open, and half of this gap is three times the blur of the image.
         above_ground_m: The nearer point of a jump to the ring above stands at least so high, m.
         gap_steps: A gap along the ring of more azimuth steps breaks it: what lies there was not seen.
         inset: How far an edge lies from the nearer point towards the farther ray, in steps: between the two,

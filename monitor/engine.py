@@ -24,6 +24,16 @@ _TIMINGS = 200
 _STAMPS = 21
 """Stamps over which rates are told: two seconds at 10 Hz."""
 
+_REFUSALS = {
+    "undecodable": "Messages of an input can not be decoded.",
+    "wrong_type": "An input carries messages of another type than the rig says.",
+    "image_size": "Images are not of the size that the intrinsics are for.",
+}
+"""Drop reasons that more data do not mend, and what they mean."""
+
+_REFUSED_IN_A_ROW = 20
+"""Such frames without a usable one between them before it is a fault: a second of two sensors."""
+
 
 class Engine:
     """One pair: feeds its watch, accounts for its frames, tells its status.
@@ -52,6 +62,7 @@ class Engine:
         self._cloud_ns: deque[int] = deque(maxlen=_STAMPS)
         self._image_ns: deque[int] = deque(maxlen=_STAMPS)
         self.wrong_size: tuple[int, int] | None = None
+        self._refused_before: Counter[str] = Counter()
         self._losses = Losses()
         self._outputs_lost: Callable[[], Mapping[str, str]] = dict
 
@@ -90,8 +101,10 @@ class Engine:
             self.wrong_size = pair.image.size
         if findings.dropped is not None:
             self._dropped[findings.dropped] += 2
+            self._fault_if_refused()
             return self._due()
         self._used += 2
+        self._refused_before = self._refused()
         return [self._frame_event(pair, findings), *self._due()]
 
     def tick(self, arrival_ns: int) -> list[Event]:
@@ -100,8 +113,26 @@ class Engine:
             self._arrival = (arrival_ns, arrival_ns)
         data_ns, since_ns = self._arrival
         self._now_ns = max(self._now_ns, data_ns + max(0, arrival_ns - since_ns))
+        self._fault_if_refused()
         self.watch.silent(self._now_ns)
         return self._due()
+
+    def _refused(self) -> Counter[str]:
+        """Frames so far that are of no use whatever the scene."""
+        dropped = self._intake.account(self.identity.pair)[1] + self._dropped
+        return Counter({reason: dropped[reason] for reason in _REFUSALS})
+
+    def _fault_if_refused(self) -> None:
+        """A stream of frames that can not be used is a fault, not silence."""
+        since = self._refused() - self._refused_before
+        if since.total() < _REFUSED_IN_A_ROW:
+            return
+        reason = max(since, key=lambda name: since[name])
+        text = _REFUSALS[reason]
+        if reason == "image_size" and self.wrong_size is not None:
+            camera, (width, height) = self.watch.mount.camera, self.wrong_size
+            text = f"Images are {width}x{height} px, the intrinsics are for {camera.width}x{camera.height}."
+        self.watch.fault(text, self._now_ns)
 
     def finish(self) -> list[Event]:
         """The input has ended: the last status."""

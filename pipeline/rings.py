@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import se3
 from pipeline.medians import group_medians, grouped, median
 from pipeline.records import Floats, PointCloud
 
@@ -287,9 +286,3 @@ def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> NDArray[np
     rank = np.empty(numbers, dtype=np.int64)
     rank[np.argsort(medians)] = np.arange(numbers)
     return rank[ring]
-
-
-def sensor_frame(T_frame_sensor: Floats, cloud: PointCloud) -> PointCloud:
-    """The cloud in the frame of its sensor, where the scan pattern is what it was when it was measured."""
-    xyz = se3.apply(se3.inverse(T_frame_sensor), cloud.xyz).astype(np.float32)
-    return PointCloud(xyz, cloud.intensity, cloud.ring, cloud.time)

@@ -208,6 +208,12 @@ class Watch:
         if self.memory.state == "stale":
             self._forget()
 
+    def fault(self, reason: str, now_ns: int) -> None:
+        """The inputs can not be worked with, for the reason given; the next judgement ends it."""
+        if self.memory is None:
+            self.memory = verdict.start(now_ns)
+        self.memory = verdict.faulted(self.memory, reason, now_ns)
+
     def finish(self, now_ns: int = 0) -> None:
         """The recording ends: a verdict that was never reached says why."""
         if self.memory is None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline import rings, se3
 from pipeline.records import PointCloud
-from pipeline.rings import scan_pattern, sensor_frame
+from pipeline.rings import scan_pattern
 from pipeline.simulation.lidar import spinning, sweep
 
 DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -214,15 +214,6 @@ def test_a_field_of_zeros_is_no_ring_field(cloud):
     order = ring_after_ring(cloud, 1.0)
     zeros = PointCloud(cloud.xyz[order], ring=np.zeros(len(cloud), np.uint16))
     assert int(pattern(zeros).ring.max()) == 63
-
-
-def test_sensor_frame_brings_the_pattern_back(cloud):
-    T = se3.transform(Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), np.array([1.0, -2.0, 0.5]))
-    moved = dataclasses.replace(cloud, xyz=se3.apply(T, cloud.xyz).astype(np.float32))
-    back = sensor_frame(T, moved)
-    np.testing.assert_allclose(back.xyz, cloud.xyz, atol=2e-4)
-    for name in ("ring", "intensity", "time"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(moved, name))
 
 
 def kitti():

@@ -25,7 +25,7 @@ from pipeline.line_witness import LineFrame, LineSolution
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.parameters import Parameters
 from pipeline.records import CameraModel, Floats, FramePair, LineMatch, Masks, PointCloud, read_only
-from pipeline.segmentation import Segmenter
+from pipeline.segmentation import Segmenter, grid_scale
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
 DropReason: TypeAlias = Literal["image_size", "empty_cloud", "no_scan_pattern", "no_edges"]
@@ -292,7 +292,13 @@ class Watch:
         with stage("masks"):
             up_cam = mount.T_cam_lidar[:3, :3] @ mount.up
             horizon = horizon_line(mount.camera, up_cam)
-            masks = masks_from_probabilities(probabilities, pair.image.pixels, self.parameters.masks, horizon)
+            masks = masks_from_probabilities(
+                probabilities,
+                pair.image.pixels,
+                self.parameters.masks,
+                horizon,
+                grid_scale(*pair.image.size),
+            )
         with stage("lines"):
             lines = line_witness.find_lines(
                 pair.cloud,

@@ -74,7 +74,7 @@ def surfels(cloud: PointCloud) -> Surfels:
     for share in CELL_SHARES:
         planes, left = _planes(xyz, time, share)
         found.append(planes)
-        xyz, time = xyz[:, left], None if time is None else time[left]
+        xyz, time = np.take(xyz, left, axis=1), None if time is None else time[left]
     return Surfels(
         np.concatenate([f.centre for f in found]),
         np.concatenate([f.normal for f in found]),
@@ -108,7 +108,10 @@ def _planes(
     chosen = np.flatnonzero(group >= 0)
     group, n = group[chosen].astype(np.int64), count[occupied].astype(np.float64)
     # Coordinates inside the cell, in units of its side: sums of squares then lose no digits.
-    local = (place[:, chosen] - corner[:, chosen] - np.float32(0.5)).astype(np.float64)
+    local = np.empty((3, chosen.size))
+    for inside_cell, p, c in zip(local, place, corner, strict=True):
+        np.subtract(p.take(chosen), c.take(chosen), out=inside_cell)
+    local -= 0.5
     mean = np.stack([np.bincount(group, weights=x, minlength=n.size) / n for x in local])
     first = np.zeros(n.size, dtype=np.int64)
     first[group] = chosen

@@ -1,5 +1,6 @@
 """One file per command: options -> call -> print. Every module offers ``command``."""
 
+import shutil
 import signal
 import sys
 import threading
@@ -90,6 +91,12 @@ def stop_on_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def viewer() -> str:
+    """The command that opens a recording: of this environment where it is not on the path."""
+    beside = Path(sys.executable).parent / "rerun"
+    return "rerun" if shutil.which("rerun") or not beside.exists() else str(beside)
 
 
 def progress_line(what: str) -> Callable[[int], None] | None:

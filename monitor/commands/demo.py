@@ -31,7 +31,7 @@ def command(*, out: Path, seed: int) -> int:
     for line in told.lines:
         click.echo(line)
     click.echo(f"report:    {out / 'report.html'} (open in a browser)")
-    click.echo(f"recording: {out / 'recording.rrd'} (open with: rerun {out / 'recording.rrd'})")
+    click.echo(f"recording: {out / 'recording.rrd'} (open with: {commands.viewer()} {out / 'recording.rrd'})")
     click.echo(f"drive:     {out / 'drive.mcap'} (judge it again: calibwatch replay {out / 'drive.mcap'})")
     if not told.summary.complete:
         return commands.INTERRUPTED

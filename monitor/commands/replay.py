@@ -93,5 +93,5 @@ def tell(summary: "Summary", out: Path, images_hz: float) -> None:
         click.echo(f"warning: {warning}", err=True)
     click.echo(
         f"report: {out / 'report.html'}\nrecording: {out / 'recording.rrd'} "
-        f"(images at {images_hz:g} Hz; open with: rerun {json.dumps(str(out / 'recording.rrd'))})"
+        f"(images at {images_hz:g} Hz; open with: {commands.viewer()} {json.dumps(str(out / 'recording.rrd'))})"
     )

@@ -11,7 +11,7 @@ from pipeline.association import NO_PAIRS, Association, associate
 from pipeline.cameras import undistort
 from pipeline.cloud_lanes import find_lanes
 from pipeline.cloud_poles import find_poles
-from pipeline.ground import fit_ground
+from pipeline.ground import Ground, fit_ground
 from pipeline.image_lines import find_image_lines
 from pipeline.records import (
     CameraImage,
@@ -81,6 +81,7 @@ def find_lines(
     up: Floats,
     forward: Floats,
     rng: np.random.Generator,
+    ground: Ground | None = None,
 ) -> LineFrame:
     """Finds lane lines and poles in the cloud, around the camera's view, and in the image.
 
@@ -93,13 +94,15 @@ def find_lines(
         up: float64 (3,), unit, LiDAR frame.
         forward: float64 (3,), unit, LiDAR frame.
         rng: For the plane and the lines.
+        ground: The ground plane of this very sweep where it was fitted before; else it is fitted here.
 
     Returns:
         The lines, and the reasons where there can be none.
     """
     reasons = []
     lines: list[CloudLine] = []
-    ground = fit_ground(cloud, up, rng)
+    if ground is None:
+        ground = fit_ground(cloud, up, rng)
     if ground is None:
         reasons.append("no ground plane in the cloud")
     else:

@@ -20,7 +20,7 @@ from pipeline.edges import RING_JUMP, find_edges
 from pipeline.ego import Ego, Straightened
 from pipeline.fusion import Testimony
 from pipeline.gradients import gradient_pyramid
-from pipeline.ground import fit_ground
+from pipeline.ground import Ground, fit_ground
 from pipeline.line_witness import LineFrame, LineSolution
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.parameters import Parameters
@@ -259,7 +259,7 @@ class Watch:
             ground = fit_ground(pair.cloud, mount.up, rng)
         with stage("edges"):
             edges = find_edges(pair.cloud, ground, mount.camera, mount.T_cam_lidar, self.parameters.edges)
-        masks, lines = self._lines_of(pair, rng, stage)
+        masks, lines = self._lines_of(pair, ground, rng, stage)
         enough = edges is not None and len(edges) >= _LEAST_EDGES
         if edges is not None and enough:
             with stage("gradients"):
@@ -278,7 +278,7 @@ class Watch:
         return Findings(dropped, pair.cloud, points, masks, lines, judged=False)
 
     def _lines_of(
-        self, pair: FramePair, rng: np.random.Generator, stage: Stage
+        self, pair: FramePair, ground: Ground | None, rng: np.random.Generator, stage: Stage
     ) -> tuple[Masks | None, LineFrame | None]:
         """Masks and lines of the frame, if it is time for them."""
         now_ns, wait_ns = pair.image_stamp_ns, self.parameters.lines_every_ns
@@ -309,6 +309,7 @@ class Watch:
                 up=mount.up,
                 forward=mount.forward,
                 rng=rng,
+                ground=ground,
             )
         self._line_frames.append((now_ns, lines))
         return masks, lines

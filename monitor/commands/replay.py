@@ -1,6 +1,5 @@
 """``calibwatch replay``: a recording through the engine, files out."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,7 +90,8 @@ def tell(summary: "Summary", out: Path, images_hz: float) -> None:
         click.echo(f"{name}: {pair.state}: {verdict_sentence(pair.last)}")
     for warning in summary.warnings:
         click.echo(f"warning: {warning}", err=True)
+    recording = out / "recording.rrd"
+    click.echo(f"report: {out / 'report.html'}")
     click.echo(
-        f"report: {out / 'report.html'}\nrecording: {out / 'recording.rrd'} "
-        f"(images at {images_hz:g} Hz; open with: {commands.viewer()} {json.dumps(str(out / 'recording.rrd'))})"
+        f"recording: {recording} (images at {images_hz:g} Hz; open with: {commands.viewer()} {recording})"
     )

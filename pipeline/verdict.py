@@ -234,7 +234,7 @@ def finish(memory: Memory, judgement: Judgement | None, frames: int, required: t
     if judgement is None:
         reason = "The clouds show no rings, so no edges could be compared with the image."
         return _enter(memory, "no_scan_pattern", reason, now_ns)
-    few = f"{frames} frame{'s' if frames != 1 else ''} are too few for a verdict"
+    few = f"{frames} frame{'s are' if frames != 1 else ' is'} too few for a verdict"
     if judgement.blind:
         return _enter(memory, "nothing_in_common", "Image and cloud show nothing in common.", now_ns)
     missing = [AXES.index(axis) for axis in required if not judgement.monitored[AXES.index(axis)]]

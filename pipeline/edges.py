@@ -285,9 +285,8 @@ def _paint(
     # Stretches of ground along one ring without a gap; strips are sought inside each.
     starts = np.flatnonzero(np.concatenate([[True], ~pairs]))
     stretch = np.cumsum(np.concatenate([[True], ~pairs])) - 1
-    along = np.concatenate(
-        [[0.0], np.cumsum(np.where(pairs, np.linalg.norm(np.diff(xyz, axis=0), axis=1), 0.0))]
-    )
+    dx, dy, dz = np.diff(np.ascontiguousarray(xyz.T))
+    along = np.concatenate([[0.0], np.cumsum(np.where(pairs, np.sqrt(dx * dx + dy * dy + dz * dz), 0.0))])
     peak = np.flatnonzero(
         on_ground
         & (intensity > road + least)

@@ -129,7 +129,8 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
     azimuth = np.mod(azimuth - middle + math.pi, 2.0 * math.pi)
     elevation = np.arctan2(xyz[:, 2], flat)
     rank = _rank_by_elevation(ring[chosen], elevation)
-    order = np.lexsort((azimuth, rank))
+    order = np.argsort(azimuth, kind="stable")
+    order = order[grouped(rank[order])]
     rank, azimuth = rank[order], azimuth[order]
     step = np.diff(azimuth)[np.diff(rank) == 0]
     step = step[step > _LEAST_STEP_RAD]
@@ -183,7 +184,9 @@ def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDA
     if not _FEWEST_RINGS <= count <= _MOST_RINGS:
         return None
     cut = np.abs(step) > _CUT_RAD
-    seam = _seam(np.mod(azimuth * sense, 2.0 * math.pi), elevation, distance, cut, count)
+    turned = azimuth * sense
+    turned = np.where(turned < 0.0, turned + 2.0 * math.pi, turned)
+    seam = _seam(turned, elevation, distance, cut, count)
     turns = (travelled + azimuth[0] * sense - seam) / (2.0 * math.pi)
     ring = np.floor(turns).astype(np.int64)
     ring -= ring[0]

@@ -6,8 +6,8 @@ STAMP := $(VENV)/.installed
 TRAIN := .venv-train
 OUT ?= out
 
-# numpy and onnxruntime threads beyond the cores only wait for each other.
-export OPENBLAS_NUM_THREADS ?= 2
+# The matrices are small: threads of BLAS cost time and gain none. onnxruntime has its own.
+export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 2
 
 .PHONY: env demo test test-full lint bench train export scenes clean

@@ -7,7 +7,7 @@ borders of the image and the fold: beyond the radius where a polynomial lens sto
 
 import importlib
 import pkgutil
-from functools import cache
+from functools import cache, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -76,6 +76,17 @@ def coefficients(D: Floats, count: int) -> tuple[float, ...]:
     return tuple(np.pad(D[:count], (0, max(0, count - len(D)))).tolist())
 
 
+def limit_of(camera: CameraModel) -> float:
+    """Largest slope ``hypot(x, y)`` for which the lens is one to one; inf where there is none."""
+    return _limit(lens_of(camera).names[0], camera.D.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _limit(name: str, coefficients: bytes) -> float:
+    """Roots of a polynomial, which a window of frames would otherwise seek a hundred times."""
+    return lens_models()[name].limit(np.frombuffer(coefficients, dtype=np.float64))
+
+
 def project(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Pixels of points in the camera frame.
 
@@ -100,7 +111,7 @@ def project(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np
 def project_unbounded(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """As :func:`project` without the borders of the image: bool (N,) tells what projects at all."""
     lens = lens_of(camera)
-    xy, valid = _slopes(lens, camera, points_cam)
+    xy, valid = _slopes(camera, points_cam)
     d = lens.distort(xy, camera.D)
     uv = d @ camera.K[:2, :2].T + camera.K[:2, 2]
     return np.where(valid[:, None], uv, np.nan), valid
@@ -117,7 +128,7 @@ def project_with_slopes(
         point is ``[A, -A xy] / Z``.
     """
     lens, K = lens_of(camera), camera.K
-    xy, valid = _slopes(lens, camera, points_cam)
+    xy, valid = _slopes(camera, points_cam)
     uv = lens.distort(xy, camera.D) @ K[:2, :2].T + K[:2, 2]
     J = lens.jacobian(xy, camera.D)
     A = np.empty((2, 2, len(xy)))
@@ -128,13 +139,13 @@ def project_with_slopes(
     return uv, valid, xy, A.transpose(2, 0, 1)
 
 
-def _slopes(lens: LensModel, camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _slopes(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """``X/Z, Y/Z`` (N,2) of points (N,3), 0 where they do not project; and which do, bool (N,)."""
     z = points_cam[:, 2]
     valid = z > NEAREST_DEPTH_M
     xy = points_cam[:, :2] / np.where(valid, z, 1.0)[:, None]
     # Squares, for hypot takes thirty times as long.
-    valid &= np.square(xy[:, 0]) + np.square(xy[:, 1]) < lens.limit(camera.D) ** 2
+    valid &= np.square(xy[:, 0]) + np.square(xy[:, 1]) < limit_of(camera) ** 2
     return (xy if valid.all() else np.where(valid[:, None], xy, 0.0)), valid
 
 
@@ -166,7 +177,7 @@ def undistort(camera: CameraModel, uv: Floats) -> Floats:
     """
     lens = lens_of(camera)
     target = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    limit = _WITHIN * lens.limit(camera.D)
+    limit = _WITHIN * limit_of(camera)
     xy = _first_guess(lens, camera.D, target, limit)
     for _ in range(_NEWTON_STEPS):
         residual = lens.distort(xy, camera.D) - target

@@ -75,7 +75,9 @@ def calibwatch(*, verbose: bool) -> None:
     Exit codes: 0 healthy or done, 1 bad input or failure, 2 wrong usage, 3 drifted, 4 no statement.
     """
     logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr
+        level=logging.INFO if verbose else logging.WARNING,
+        format="%(levelname)s: %(message)s",
+        stream=sys.stderr,
     )
 
 
@@ -97,7 +99,9 @@ def main(arguments: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(BAD_INPUT)
     except Exception as error:  # noqa: BLE001 - the top of the program: reports and ends
-        click.echo(f"calibwatch: internal error: {_one_line(repr(error))} (trace in {_trace_file()})", err=True)
+        click.echo(
+            f"calibwatch: internal error: {_one_line(repr(error))} (trace in {_trace_file()})", err=True
+        )
         sys.exit(BAD_INPUT)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -103,10 +103,10 @@ def demo(out: Path, seed: int, stop: threading.Event, progress: Callable[[str], 
         stop=stop,
         progress=lambda pairs: progress(f"replaying over zenoh, pair {pairs}"),
     )
-    return Told(summary, *_timeline(summary))
+    return Told(summary, *timeline(summary))
 
 
-def _timeline(summary: Summary) -> tuple[tuple[str, ...], bool]:
+def timeline(summary: Summary) -> tuple[tuple[str, ...], bool]:
     """What was told when, in seconds of the drive, and whether that is what should be told."""
     pair = summary.pairs["front"]
     truth = f"the mount turns {YAW_DEG:+.2f} deg in yaw and slips {LEFT_M:+.3f} m left"

@@ -3,11 +3,11 @@
 from collections import Counter
 from dataclasses import dataclass
 
-from monitor.messages import CameraInfo, Decoded, Message, decode
-from monitor.rig import Rig, RigPair, camera_from_info
+from monitor.messages import Decoded, Message, decode
+from monitor.rig import Rig, RigPair
 from monitor.sync import Paired, Pairer, Side, middle_ns, pairer_for
-from pipeline.errors import CalibwatchError, InputError
-from pipeline.records import CameraImage, CameraModel, FramePair, PointCloud
+from pipeline.errors import InputError
+from pipeline.records import CameraImage, FramePair, PointCloud
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,6 @@ class _Lane:
 
     pair: RigPair
     pairer: Pairer[object, object]
-    camera: CameraModel | None
     dropped: Counter[str]
     received: int = 0
 
@@ -41,13 +40,9 @@ class Intake:
     """
 
     def __init__(self, rig: Rig) -> None:
-        self._lanes = [_Lane(pair, pairer_for(pair), pair.camera.model, Counter()) for pair in rig.pairs]
+        self._lanes = [_Lane(pair, pairer_for(pair), Counter()) for pair in rig.pairs]
         self._told: set[tuple[str, str]] = set()
         self.notes: list[str] = []
-
-    def camera(self, pair: str) -> CameraModel | None:
-        """Intrinsics of a pair, once they are known."""
-        return self._lane(pair).camera
 
     def account(self, pair: str) -> tuple[int, Counter[str]]:
         """Frames (sweeps and images) that came for a pair, and what was dropped before it became a pair."""
@@ -66,8 +61,7 @@ class Intake:
         lanes = [
             (lane, side) for lane in self._lanes if (side := _side_of(lane.pair, message.topic)) is not None
         ]
-        infos = [lane for lane in self._lanes if lane.pair.camera.info == message.topic]
-        if not lanes and not any(lane.camera is None for lane in infos):
+        if not lanes:
             return []
         for lane, _ in lanes:
             lane.received += 1
@@ -78,8 +72,6 @@ class Intake:
             for lane, _ in lanes:
                 lane.dropped["undecodable"] += 1
             return []
-        for lane in infos:
-            self._inform(lane, decoded)
         pairs: list[FramePair] = []
         for lane, side in lanes:
             pairs += self._push(lane, side, message, decoded)
@@ -120,20 +112,6 @@ class Intake:
                     continue
             pairs += [_frame_pair(lane.pair, paired) for paired in found]
         return pairs
-
-    def _inform(self, lane: _Lane, decoded: tuple[Decoded, ...]) -> None:
-        """Takes intrinsics from the first CameraInfo of a lane that has none."""
-        if lane.camera is not None:
-            return
-        for one in decoded:
-            if isinstance(one.value, CameraInfo):
-                topic = lane.pair.camera.topic or ""
-                try:
-                    lane.camera, _ = camera_from_info(
-                        one.value, rectified=lane.pair.camera.rectified, topic=topic
-                    )
-                except CalibwatchError as error:
-                    self._tell(topic, "intrinsics", str(error))
 
     def _lane(self, pair: str) -> _Lane:
         return next(lane for lane in self._lanes if lane.pair.name == pair)

@@ -126,18 +126,23 @@ def _write(
     tasks = [range(first, min(first + _FRAMES_A_TASK, total)) for first in starts]
     writer.add_message(channels[TF_TOPIC], log_time=START_NS, publish_time=START_NS, data=tf)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for messages in pool.map(_simulated, [parameters] * len(tasks), tasks):
-            for sent in messages:
-                writer.add_message(
-                    channels[sent.topic],
-                    log_time=sent.log_ns,
-                    publish_time=sent.stamp_ns,
-                    data=sent.data,
-                    sequence=counts[sent.topic],
-                )
-                counts[sent.topic] += 1
-            if progress is not None:
-                progress(counts[CLOUD_TOPIC], total)
+        try:
+            for messages in pool.map(_simulated, [parameters] * len(tasks), tasks):
+                for sent in messages:
+                    writer.add_message(
+                        channels[sent.topic],
+                        log_time=sent.log_ns,
+                        publish_time=sent.stamp_ns,
+                        data=sent.data,
+                        sequence=counts[sent.topic],
+                    )
+                    counts[sent.topic] += 1
+                if progress is not None:
+                    progress(counts[CLOUD_TOPIC], total)
+        except BaseException:
+            # Whoever interrupts need not wait for the rest of the drive.
+            pool.shutdown(cancel_futures=True)
+            raise
     writer.add_metadata(METADATA, _truth(parameters))
     writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without a return type
 

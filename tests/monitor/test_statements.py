@@ -1,0 +1,100 @@
+"""Belief and memory as a status: units, names, and nulls where nothing is known."""
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from monitor.statements import Identity, Measured, status_of
+from monitor.status import AXIS_NAMES, Provenance, Rates
+from pipeline import fusion, verdict
+from pipeline.drift_test import Judgement
+from pipeline.records import CameraModel
+from pipeline.watch import Belief, Mount
+
+NONE = Provenance(hash=None, version=None)
+LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.2, 0.15, 0.15])
+DRIFT = np.array([math.radians(0.1), math.radians(-0.2), math.radians(0.3), 0.04, -0.05, 0.06])
+MOUNT = Mount(
+    camera=CameraModel("pinhole", np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), np.empty(0), 160, 120),
+    T_cam_lidar=np.eye(4),
+    T_vehicle_lidar=None,
+    sigma_rad=0.001,
+    sigma_m=0.01,
+    limits=LIMITS,
+    required=("yaw",),
+)
+
+
+def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT):
+    rates = Rates(lidar_hz=None, camera_hz=None, gap_ms=None)
+    measured = Measured(
+        received=7,
+        used=4,
+        dropped=Counter(undecodable=3),
+        window_ns=window_ns,
+        lines_ns=lines_ns,
+        rates=rates,
+        timing={},
+        outputs_lost={"report": "the disk is full"},
+    )
+    identity = Identity("van-1", "front", NONE, NONE, "calibwatch test")
+    return status_of(identity, mount, verdict.start(5), belief, measured, 3, 9)
+
+
+def judged():
+    known = np.array([True, True, True, True, True, False])
+    spread = np.where(known, 0.01, np.inf)
+    judgement = Judgement(
+        drift=DRIFT,
+        sigma=spread,
+        protection_level=spread,
+        detectable=spread,
+        observable=known,
+        monitored=np.array([False, False, True, False, False, False]),
+        excluded=known,
+        statistic=1.0,
+        alarming=False,
+        suspicious=False,
+        blind=False,
+        contradicted=False,
+    )
+    testimony = fusion.Testimony(DRIFT, np.diag(np.full(6, 100.0)))
+    return Belief(judgement, np.eye(4), None, None, testimony, None, ())
+
+
+def test_without_a_belief_every_number_is_null_but_the_limits():
+    status = said()
+    assert (status.seq, status.stamp_ns, status.state) == (3, 9, "starting")
+    assert status.frames.model_dump() == {"received": 7, "used": 4, "dropped": {"undecodable": 3}}
+    for (_, axis), limit in zip(status.drift.items(), (0.75, 0.5, 0.5, 0.2, 0.15, 0.15), strict=True):
+        assert axis.value is axis.sigma is axis.protection_level is axis.detectable is None
+        assert not axis.observable
+        assert axis.alert_limit == pytest.approx(limit)
+    assert status.witnesses.lines is status.witnesses.edges is None
+    assert (status.window.frames, status.window.span_s) == (0, 0.0)
+    assert status.outputs_lost == {"report": "the disk is full"}
+
+
+def test_angles_are_told_in_degrees_and_lengths_in_metres_and_what_is_held_has_no_bound():
+    status = said(judged())
+    values = [status.drift[name].value for name in AXIS_NAMES]
+    assert values == pytest.approx([0.1, -0.2, 0.3, 0.04, -0.05, 0.06])
+    assert status.drift.roll.sigma == pytest.approx(math.degrees(0.01))
+    assert status.drift.forward.protection_level == pytest.approx(0.01)
+    assert status.drift.up.sigma is status.drift.up.protection_level is status.drift.up.detectable is None
+    assert [status.drift[name].monitored for name in AXIS_NAMES] == [False, False, True, False, False, False]
+
+
+def test_the_axes_are_those_of_the_vehicle_only_where_it_is_known():
+    assert said().drift.axes == "camera"
+    vehicle = Mount(*(np.eye(4) if f == "T_vehicle_lidar" else getattr(MOUNT, f) for f in Mount.__slots__))
+    assert said(mount=vehicle).drift.axes == "vehicle"
+
+
+def test_the_window_is_that_of_the_edges_else_of_the_lines():
+    second = 1_000_000_000
+    assert said(window_ns=(second, 2 * second), lines_ns=(0,)).window.span_s == 1.0
+    window = said(lines_ns=(0, second, 3 * second)).window
+    assert (window.frames, window.span_s) == (3, 3.0)

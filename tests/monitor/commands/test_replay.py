@@ -58,7 +58,7 @@ def test_an_injected_drift_is_told_with_axis_sign_and_size(replayed, cut, axis, 
 
 def test_exit_zero_turns_the_verdicts_code_off_and_json_prints_the_summary(calibwatch, cut, tmp_path):
     code, out, err = calibwatch(
-        "replay", cut(8), "--inject", "yaw=1", "--out", tmp_path, "--exit-zero", "--json"
+        "replay", cut(12), "--inject", "yaw=1", "--out", tmp_path, "--exit-zero", "--json"
     )
     assert (code, err) == (0, "")
     assert json.loads(out) == json.loads((tmp_path / "summary.json").read_bytes())
@@ -95,7 +95,7 @@ def test_the_same_recording_says_the_same_twice_and_over_zenoh(calibwatch, cut, 
 
 @pytest.mark.parametrize("shift_ns", [3600 * 10**9, -drives.START_NS])
 def test_the_clock_of_the_recorder_decides_nothing(replayed, messages, tmp_path, shift_ns):
-    first = drives.first_frames(messages, 8)
+    first = drives.first_frames(messages, 12)
     shifted = [dataclasses.replace(message, log_ns=message.log_ns + shift_ns) for message in first]
     _, _, summary = replayed(drives.write(tmp_path / "shifted.mcap", shifted), "--inject", "yaw=1")
     pair = summary["pairs"]["camera"]
@@ -136,9 +136,9 @@ def test_a_cloud_without_intensity_works_and_says_what_it_costs(replayed, messag
         data = encode_point_cloud2(cloud, drives.stamp_of(message), "lidar")
         return dataclasses.replace(message, data=data)
 
-    first = drives.changed(drives.first_frames(messages, 8), CLOUD_TOPIC, bare)
+    first = drives.changed(drives.first_frames(messages, 12), CLOUD_TOPIC, bare)
     code, err, summary = replayed(drives.write(tmp_path / "bare.mcap", first), "--inject", "yaw=1")
-    assert (code, summary["pairs"]["camera"]["frames"]["used"]) == (3, 16)
+    assert (code, summary["pairs"]["camera"]["frames"]["used"]) == (3, 24)
     assert err == f"warning: topic {CLOUD_TOPIC} has no intensity: its clouds show no lane markings\n"
 
 
@@ -181,12 +181,12 @@ def test_stamps_that_jump_start_a_new_window(replayed, messages, tmp_path):
     def jump(message):
         return drives.stamped(message, drives.stamp_of(message) + (hour if message.sequence >= 4 else 0))
 
-    first = drives.first_frames(messages, 12)
+    first = drives.first_frames(messages, 18)
     jumped = drives.changed(drives.changed(first, IMAGE_TOPIC, jump), CLOUD_TOPIC, jump)
     code, err, summary = replayed(drives.write(tmp_path / "jump.mcap", jumped), "--inject", "yaw=1")
     pair = summary["pairs"]["camera"]
     assert (code, err) == (3, "")
-    assert pair["frames"] == {"received": 24, "used": 24, "dropped": {}}
+    assert pair["frames"] == {"received": 36, "used": 36, "dropped": {}}
     told = next(change for change in pair["timeline"] if change["state"] == "drifted")
     # Four frames before the jump are too few; none of them may count after it.
     assert told["stamp_ns"] > drives.START_NS + hour + 800_000_000

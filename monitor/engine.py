@@ -31,6 +31,9 @@ _REFUSALS = {
 }
 """Drop reasons that more data do not mend, and what they mean."""
 
+_LOST_ON_THE_WAY = frozenset({"queue_overflow", "bus_gap", "bus_gap_estimated"})
+"""Losses of a live source that are frames of the watched inputs; the others are told as warnings."""
+
 _REFUSED_IN_A_ROW = 20
 """Such frames without a usable one between them before it is a fault: a second of two sensors."""
 
@@ -153,7 +156,7 @@ class Engine:
         assert memory is not None  # noqa: S101 - set by the first step, tick or finish
         self._told, self._told_ns = (memory.state, memory.code), self._now_ns
         received, dropped = self._intake.account(self.identity.pair)
-        lost = Counter(self._losses.counts)
+        lost = Counter({reason: n for reason, n in self._losses.counts.items() if reason in _LOST_ON_THE_WAY})
         status = status_of(
             self.identity,
             self.watch.mount,

@@ -119,8 +119,27 @@ def find_edges(
     camera: CameraModel,
     T_cam_lidar: Floats,
     parameters: EdgeParameters,
+    origin: Floats | None = None,
 ) -> Edges | None:
-    """Edges of the cloud that fall into the image or just beside it; None where the cloud shows no rings."""
+    """Edges of the cloud that fall into the image or just beside it; None where the cloud shows no rings.
+
+    Args:
+        cloud: The sweep.
+        ground: Its ground plane, or None: no jumps between rings, no paint.
+        camera: Intrinsics.
+        T_cam_lidar: float64 (4,4), the stored extrinsic.
+        parameters: What counts as an edge.
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+            its origin.
+    """
+    if origin is not None and origin.any():
+        there = dataclasses.replace(cloud, xyz=cloud.xyz - origin.astype(np.float32))
+        plane = None
+        if ground is not None:
+            plane = dataclasses.replace(ground, offset=ground.offset + float(ground.normal @ origin))
+        moved = T_cam_lidar @ se3.transform(np.eye(3), origin)
+        found = find_edges(there, plane, camera, moved, parameters)
+        return None if found is None else dataclasses.replace(found, position=found.position + origin)
     for turn in spin_turns(cloud):
         if np.array_equal(turn, np.eye(3)):
             found = _about_z(cloud, ground, camera, T_cam_lidar, parameters)

@@ -43,8 +43,8 @@ class MaskParameters:
         crf: Kernel widths in px of the reference width, or None: the network's probabilities as they are. The
             default is gentle: weight 10 and widths of 80 px, common for large objects, take away poles of up
             to 8 px whose contrast is below 20 grey levels although the network saw every pixel of them.
-        evidence: Least probability of paint or pole that lets a pixel take part in the CRF; from it to one half
-            it is 2.9 nats, three quarters of what full agreement under the default kernels could add.
+        evidence: Least probability of paint or pole that lets a pixel take part in the CRF; to one half it is
+            2.9 nats from there, three quarters of what full agreement under the default kernels could add.
         reach_sigmas: Pixels within this many appearance widths of evidence take part in the CRF; beyond two a
             pixel weighs less than an eighth of a near one.
         pole_keep: Least share of a pole's pixels, 0..1, that the CRF must leave, or the network's own mask
@@ -90,7 +90,7 @@ def masks_from_probabilities(
         parameters: Thresholds, CRF and least sizes.
         horizon: float64 (3,), line ``l`` in image px with ``l . (u, v, 1) > 0`` on the ground's side
             (:func:`horizon_line`), or None: paint may lie anywhere.
-        scale: Grid px per image px (``segmentation.grid_scale``), or None: the grid ends where the image does.
+        scale: Grid px per image px (``segmentation.grid_scale``), or None: it ends where the image does.
             A network's grid ends beyond it where the image's size is odd.
 
     Returns:

@@ -4,6 +4,7 @@ Nothing is set per sensor. A ring number in the cloud is used where there is one
 order of the points (ring after ring) or off their elevation. A cloud without any such pattern gives None.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -289,3 +290,69 @@ def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> NDArray[np
     rank = np.empty(numbers, dtype=np.int64)
     rank[np.argsort(medians)] = np.arange(numbers)
     return rank[ring]
+
+
+_ORIGIN_POINTS = 8000
+"""Points that tell where the sensor stands: some hundred a ring."""
+
+_ORIGIN_STEPS = 12
+"""Gauss-Newton steps; from 2 m off the last one moves by less than a millimetre."""
+
+_NEAREST_ORIGIN_M = 0.5
+"""m; the lasers of one sensor sit up to 0.2 m apart, and edges bear 0.3 m (PROBE 8), so less is no shift."""
+
+_FARTHEST_ORIGIN_M = 5.0
+"""m; a vehicle's own frame lies nearer."""
+
+_SHARPER = 0.5
+"""Share of the rings' spread that must be gone when they are seen from the origin that was found."""
+
+_OUTLIER_SIGMAS = 3.0
+"""Robust sigmas beyond which a point does not count: near objects between the lasers."""
+
+
+def sensor_origin(cloud: PointCloud) -> Floats:
+    """Where the sensor stands in the cloud's frame, float64 (3,), m; zero where it stands at the origin.
+
+    Rings are cones with one apex (PROBE 8): seen from there each keeps its elevation. A cloud that was moved to
+    the vehicle's frame shows its rings bent instead, which tells the way back.
+    """
+    turn = spin_turns(cloud)[0]
+    ring = _rings(dataclasses.replace(cloud, xyz=(cloud.xyz @ turn.T).astype(np.float32)))
+    if ring is None:
+        return np.zeros(3)
+    chosen = np.flatnonzero(ring >= 0)
+    chosen = chosen[:: max(1, len(chosen) // _ORIGIN_POINTS)]
+    order = chosen[np.argsort(ring[chosen], kind="stable")]
+    group = np.unique(ring[order], return_inverse=True)[1]
+    xyz = cloud.xyz[order].astype(np.float64) @ turn.T
+    before = _cone_errors(xyz, group)[0]
+    origin = np.zeros(3)
+    for _ in range(_ORIGIN_STEPS):
+        error, J = _cone_errors(xyz - origin, group)
+        spread = 1.48 * median(np.abs(error))
+        kept = np.abs(error) <= _OUTLIER_SIGMAS * max(spread, 1e-9)
+        information = J[kept].T @ J[kept] + 1e-9 * np.eye(3)
+        origin = origin - np.linalg.solve(information, J[kept].T @ error[kept])
+        if float(np.linalg.norm(origin)) > _FARTHEST_ORIGIN_M:
+            return np.zeros(3)
+    after = _cone_errors(xyz - origin, group)[0]
+    sharper = median(np.abs(after)) < _SHARPER * median(np.abs(before))
+    shifted = float(np.linalg.norm(origin)) > _NEAREST_ORIGIN_M
+    return np.asarray(origin @ turn if sharper and shifted else np.zeros(3), dtype=np.float64)
+
+
+def _cone_errors(p: Floats, group: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Angle (N,) of points from the cone of their ring about z, and its slope (N,3) by the apex."""
+    rho = np.maximum(np.hypot(p[:, 0], p[:, 1]), 1e-6)
+    count = int(group[-1]) + 1
+    k = group_medians(p[:, 2] / rho, group, count)[group]
+    reach = np.hypot(rho, p[:, 2]) * np.sqrt(1.0 + k * k)
+    error = (p[:, 2] - k * rho) / reach
+    J = np.column_stack([k * p[:, 0] / rho, k * p[:, 1] / rho, -np.ones(len(p))]) / reach[:, None]
+    # The cone of each ring is fitted anew at every apex: what all its points share tells nothing.
+    members = np.maximum(np.bincount(group, minlength=count), 1)
+    table = np.column_stack([error, J])
+    means = np.column_stack([np.bincount(group, column, minlength=count) / members for column in table.T])
+    table -= means[group]
+    return table[:, 0], table[:, 1:]

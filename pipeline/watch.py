@@ -25,6 +25,7 @@ from pipeline.line_witness import LineFrame, LineSolution
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.parameters import Parameters
 from pipeline.records import CameraModel, Floats, FramePair, LineMatch, Masks, PointCloud, read_only
+from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter, grid_scale
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
@@ -173,6 +174,7 @@ class Watch:
         self._segmenter = segmenter
         ahead = mount.T_cam_lidar[2, :3]
         self._ego = Ego(mount.up, ahead, mount.spin)
+        self._origin: Floats | None = None
         self._edge_frames: deque[EdgeFrame] = deque()
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
         self._begun_ns = 0
@@ -252,13 +254,18 @@ class Watch:
             return Findings("empty_cloud", pair.cloud, nothing, None, None, judged=False)
         self._count += 1
         rng = np.random.default_rng([self.parameters.seed, self._count])
+        if self._origin is None:
+            # Of the sweep as it was measured: straightening bends its rings.
+            self._origin = sensor_origin(pair.cloud)
         with stage("motion"):
             straight = self._ego.straighten(pair)
         pair = dataclasses.replace(pair, cloud=straight.cloud)
         with stage("ground"):
             ground = fit_ground(pair.cloud, mount.up, rng)
         with stage("edges"):
-            edges = find_edges(pair.cloud, ground, mount.camera, mount.T_cam_lidar, self.parameters.edges)
+            edges = find_edges(
+                pair.cloud, ground, mount.camera, mount.T_cam_lidar, self.parameters.edges, self._origin
+            )
         masks, lines = self._lines_of(pair, ground, rng, stage)
         enough = edges is not None and len(edges) >= _LEAST_EDGES
         if edges is not None and enough:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline import rings, se3
 from pipeline.records import PointCloud
-from pipeline.rings import scan_pattern
+from pipeline.rings import scan_pattern, sensor_origin
 from pipeline.simulation.lidar import spinning, sweep
 
 DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -244,3 +244,15 @@ def test_elevations_tell_the_rings_that_the_file_names_or_nothing(name):
         assert found is None
         return
     assert same_rings(found.ring, cloud.ring[found.index]) > 0.99
+
+
+@pytest.mark.parametrize("shift", [(1.2, -0.4, 1.7), (-0.9, 0.0, 0.3), (0.0, 0.0, 1.8)])
+def test_where_the_sensor_stands_is_found_in_a_cloud_of_the_vehicle(cloud, shift):
+    moved = dataclasses.replace(cloud, xyz=(cloud.xyz + np.array(shift)).astype(np.float32))
+    np.testing.assert_allclose(sensor_origin(moved), shift, atol=0.1)
+
+
+def test_a_sensor_at_its_own_origin_and_a_cloud_without_rings_are_left_alone(cloud):
+    assert not sensor_origin(cloud).any()
+    some = np.random.default_rng(0).normal(0.0, 5.0, (3000, 3)).astype(np.float32)
+    assert not sensor_origin(PointCloud(some)).any()

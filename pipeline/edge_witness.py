@@ -8,17 +8,18 @@ same car is one witness.
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import cameras, se3
+from pipeline import cameras, se3, trust_region
 from pipeline.edges import CELLS, Edges
 from pipeline.gradients import GradientPyramid, sample
 from pipeline.records import CameraModel, Floats
+from pipeline.trust_region import SearchParameters
 
 UNITS = np.array([math.radians(0.25)] * 3 + [0.05] * 3)
 """Alert units in which steps are measured (0.25 deg, 5 cm): each matters about as much to perception."""
@@ -30,13 +31,18 @@ class EdgeWitnessParameters:
 
     Attributes:
         step_limits: Longest step at each level of the pyramid, alert units: what its blur can bridge.
-        most_steps: Steps per level.
-        least_step: Search ends when a step is shorter, alert units: 0.003 deg, a tenth of the least sigma.
+        search: When the climb of one level ends; its lengths are alert units.
         difference: Step of the differences that give the Hessian, alert units.
         eigenvalue_floor: Smallest eigenvalue of the Hessian as a share of the largest.
         sigma_factor: Scatter of window estimates over their stated sigma on four drives (PROBE 4): k.
         least_gain: A maximum reached over a coarser level must score so much more to be preferred, share:
             coarse levels lead into false modes, which score up to 3 % more; real drifts gain over 12 %.
+        stirring_gain: Where the best maximum scores so much more than the stored extrinsic, share, others are
+            sought from further away: what looks like one small drift may be another, larger one.
+        wide_gain: A maximum found from further away must score so much more than the best near one: false
+            modes score up to 3 % more than the truth (PROBE 6).
+        wide_rad: Turn about each axis from which it is sought.
+        wide_m: Shift along each axis from which it is sought.
         farthest_rad: A maximum further from the stored extrinsic is not believed.
         farthest_m: Likewise.
         contrast_starts: Random extrinsics that tell the score of chance.
@@ -46,12 +52,15 @@ class EdgeWitnessParameters:
     """
 
     step_limits: tuple[float, float, float] = (0.3, 0.6, 1.0)
-    most_steps: int = 40
-    least_step: float = 0.01
+    search: SearchParameters = field(default_factory=SearchParameters)
     difference: float = 0.3
     eigenvalue_floor: float = 0.01
     sigma_factor: float = 2.0
     least_gain: float = 0.02
+    stirring_gain: float = 0.03
+    wide_gain: float = 0.05
+    wide_rad: float = math.radians(1.0)
+    wide_m: float = 0.3
     farthest_rad: float = math.radians(5.0)
     farthest_m: float = 1.0
     contrast_starts: int = 48
@@ -303,12 +312,34 @@ def _best_maximum(
             continue
         if schedule:
             candidate, value = _ascend(batch, T_stored, candidate, 0, parameters)
-        far = float(np.linalg.norm(candidate[:3])) > parameters.farthest_rad
-        far = far or float(np.linalg.norm(candidate[3:])) > parameters.farthest_m
         wanted = best * (1.0 + parameters.least_gain) if schedule else best
-        if value > wanted and not far:
+        if value > wanted and _near(candidate, parameters):
             xi, best = candidate, value
-    return xi, best
+    if best <= stored[0] * (1.0 + parameters.stirring_gain):
+        return xi, best
+    candidate, value = _from_further_away(batch, thin, T_stored, xi, parameters)
+    better = value > best * (1.0 + parameters.wide_gain) and _near(candidate, parameters)
+    return (candidate, value) if better else (xi, best)
+
+
+def _near(xi: Floats, parameters: EdgeWitnessParameters) -> bool:
+    """Whether an answer lies where it may be believed."""
+    turn, shift = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
+    return turn <= parameters.farthest_rad and shift <= parameters.farthest_m
+
+
+def _from_further_away(
+    batch: EdgeBatch, thin: EdgeBatch, T_stored: Floats, xi: Floats, parameters: EdgeWitnessParameters
+) -> tuple[Floats, float]:
+    """The highest maximum reached from turns and shifts of each axis, both ways; its score."""
+    steps = np.diag([parameters.wide_rad] * 3 + [parameters.wide_m] * 3)
+    top, height = xi, score(thin, se3.retract(T_stored, xi), 0)[0]
+    for start in np.concatenate([steps, -steps]):
+        reached, _ = _ascend(thin, T_stored, start, 1, parameters)
+        reached, value = _ascend(thin, T_stored, reached, 0, parameters)
+        if value > height and _near(reached, parameters):
+            top, height = reached, value
+    return _ascend(batch, T_stored, top, 0, parameters)
 
 
 _COARSE_STRIDE = 3
@@ -336,7 +367,9 @@ def _ascend(
     value, gradient, share = scored or score(batch, se3.retract(T_stored, xi), level)
     curvature = _start_curvature(share * UNITS, batch.weight, value)
     start = (-value, -gradient * UNITS)
-    x, least = _descend(negative, xi / UNITS, start, curvature, parameters.step_limits[level], parameters)
+    x, least = trust_region.descend(
+        negative, xi / UNITS, start, curvature, parameters.step_limits[level], parameters.search
+    )
     return np.asarray(x * UNITS, dtype=np.float64), -least
 
 
@@ -346,60 +379,6 @@ def _start_curvature(share: Floats, weight: Floats, value: float) -> Floats:
     per_edge = share * (total / np.maximum(weight, 1e-12))[:, None]
     outer = (per_edge * (weight / total)[:, None]).T @ per_edge
     return np.asarray(4.0 / max(value, 1e-6) * outer + 1e-6 * np.eye(6), dtype=np.float64)
-
-
-def _descend(
-    function: Callable[[Floats], tuple[float, Floats]],
-    x: Floats,
-    start: tuple[float, Floats],
-    B: Floats,
-    radius: float,
-    parameters: EdgeWitnessParameters,
-) -> tuple[Floats, float]:
-    """The minimum and its value by trust-region BFGS in alert units: steps stay inside the blur's basin."""
-    value, gradient = start
-    limit = radius
-    for _ in range(parameters.most_steps):
-        step = _trust_region_step(B, gradient, radius)
-        length = float(np.linalg.norm(step))
-        if length < parameters.least_step:
-            break
-        new_value, new_gradient = function(x + step)
-        predicted = -float(gradient @ step + 0.5 * step @ B @ step)
-        ratio = (value - new_value) / predicted if predicted > 0 else -1.0
-        change = new_gradient - gradient
-        curvature = float(step @ change)
-        if curvature > 1e-8 * length * float(np.linalg.norm(change)):
-            Bs = B @ step
-            B = B - np.outer(Bs, Bs) / float(step @ Bs) + np.outer(change, change) / curvature
-        if ratio > _ACCEPT:
-            x, value, gradient = x + step, new_value, new_gradient
-        radius = 0.5 * length if ratio < _SHRINK else min(limit, max(radius, 2.0 * length))
-    return x, value
-
-
-_ACCEPT, _SHRINK = 1e-4, 0.25
-"""Shares of the predicted decrease: below the first no step is taken, below the second it is halved."""
-
-
-def _trust_region_step(B: Floats, gradient: Floats, radius: float) -> Floats:
-    """The minimum of the quadratic model within ``radius``, by the eigenvalues of the 6x6 curvature."""
-    values, vectors = np.linalg.eigh(B)
-    g = vectors.T @ gradient
-    values = np.maximum(values, 1e-9)
-    step = -g / values
-    if np.linalg.norm(step) <= radius:
-        return np.asarray(vectors @ step, dtype=np.float64)
-    low, high = 0.0, float(np.linalg.norm(g)) / radius
-    # Plain numbers: six of them are too few for numpy.
-    terms = list(zip(np.square(g).tolist(), values.tolist(), strict=True))
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        if sum(square / (value + middle) ** 2 for square, value in terms) > radius * radius:
-            low = middle
-        else:
-            high = middle
-    return np.asarray(vectors @ (-g / (values + high)), dtype=np.float64)
 
 
 _PENALTY = 0.004
@@ -433,7 +412,7 @@ def _best_inside(
     B = _start_curvature(share * UNITS, batch.weight, best) * scale
     B = B + 2.0 * _PENALTY * (UNITS[:, None] * inverse * UNITS[None, :])
     start = (-stored * scale, -gradient * scale * UNITS)
-    found, _ = _descend(cost, np.zeros(6), start, B, parameters.step_limits[0], parameters)
+    found, _ = trust_region.descend(cost, np.zeros(6), start, B, parameters.step_limits[0], parameters.search)
     return np.asarray(found * UNITS, dtype=np.float64)
 
 

@@ -201,7 +201,7 @@ class Engine:
             edge_points=findings.edge_points,
             T_stored=self.watch.mount.T_cam_lidar,
             T_estimated=None if belief is None else belief.T_estimated,
-            matches=() if belief is None or lines is None else belief.matches,
+            matches=belief.matched[-1] if belief is not None and lines is not None and belief.matched else (),
             cloud_lines=() if lines is None else lines.cloud_lines,
             image_lines=() if lines is None else lines.image_lines,
         )

@@ -56,6 +56,10 @@ class Intake:
         """Median of camera stamp minus LiDAR stamp, ns."""
         return self._lane(pair).pairer.offset_ns
 
+    def clock_jumps(self, pair: str) -> int:
+        """How often the stamps of a pair's inputs jumped."""
+        return self._lane(pair).pairer.clock_jumps
+
     def take(self, message: Message) -> list[FramePair]:
         """The pairs that a message completes. What can not be decoded is counted and told once per topic."""
         lanes = [

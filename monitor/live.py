@@ -76,7 +76,10 @@ def run(
         return begun + clock.monotonic_ns()
 
     with bus.open_session(settings) as session:
-        rig = completed(rig, lambda: _survey(session, rig, now_ns, stop))
+        complete = _completed(rig, lambda: _survey(session, rig, now_ns, stop), stop)
+        if complete is None:
+            return "starting"
+        rig = complete
         if out is not None:
             _make(out)
         surroundings = Surroundings(rig.vehicle, folder=out, session=session, images_hz=images_hz)
@@ -98,6 +101,27 @@ def _make(folder: Path) -> None:
         raise InputError(
             f"folder {folder} can not be made: {error.strerror}", hint="--out wants a folder"
         ) from error
+
+
+def _completed(rig: Rig, survey: Callable[[], Survey], stop: threading.Event) -> Rig | None:
+    """The rig with what its file leaves open, however late that comes; None where it was stopped before.
+
+    Raises:
+        RigError: The file wants something that the bus can not give.
+    """
+    if any(pair.store is not None for pair in rig.pairs):
+        return completed(rig, survey)
+    waiting = ""
+    while not stop.is_set():
+        if not waiting and any(pair.camera.model is None or pair.T_cam_lidar is None for pair in rig.pairs):
+            _log.warning("listening for the intrinsics and transforms that the rig file leaves open")
+        try:
+            return completed(rig, survey)
+        except RigError as error:
+            if error.what != waiting:
+                waiting = error.what
+                _log.warning("still waiting: %s", waiting)
+    return None
 
 
 def _survey(session: zenoh.Session, rig: Rig, now_ns: Callable[[], int], stop: threading.Event) -> Survey:

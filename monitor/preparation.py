@@ -103,13 +103,19 @@ def _from_file(rig_file: Path, own: dict[str, object] | None, topics: Sequence[T
 
 
 def _placed(pair: RigPair, folder: Rig) -> RigPair:
-    """A pair without topics gets those of the folder's pair of that name, else of the first."""
-    if pair.lidar.topic is not None or pair.camera.topic is not None:
+    """What a pair leaves open comes from the folder's pair of its topics, of its name, else the first."""
+    named = pair.lidar.topic is not None or pair.camera.topic is not None
+    fits = [
+        other
+        for other in folder.pairs
+        if (pair.lidar.topic in (None, other.lidar.topic) and pair.camera.topic in (None, other.camera.topic))
+    ]
+    if named and not fits:
         return pair
-    own = next((other for other in folder.pairs if other.name == pair.name), folder.pairs[0])
+    own = next((other for other in fits if other.name == pair.name), fits[0])
     return dataclasses.replace(
         pair,
-        lidar=dataclasses.replace(pair.lidar, topic=own.lidar.topic),
+        lidar=dataclasses.replace(pair.lidar, topic=own.lidar.topic, spin=pair.lidar.spin or own.lidar.spin),
         camera=dataclasses.replace(pair.camera, topic=own.camera.topic),
         pairing=own.pairing,
     )

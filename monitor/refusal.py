@@ -13,6 +13,10 @@ _SCENE_REASONS = frozenset({"no_scan_pattern", "no_edges", "empty_cloud"})
 """Drop reasons that speak of scene or sensor, a verdict by themselves; the others speak of a wrong input."""
 
 
+_APART_NS = 1_000_000_000
+"""ns between image and sweep beyond which their clocks are not one: ten frames."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Account:
     """What became of the frames of one pair.
@@ -80,9 +84,17 @@ def _hint(dropped: Counter[str]) -> str:
 
 
 def drop_notes(accounts: Sequence[Account], intake: Intake) -> list[str]:
-    """One line per pair that lost frames."""
+    """One line for each pair that lost frames, and for stamps that can not be right."""
     notes = []
     for account in accounts:
+        offset, jumps = intake.offset_ns(account.pair), intake.clock_jumps(account.pair)
+        if account.used and offset is not None and abs(offset) > _APART_NS:
+            notes.append(
+                f"pair {account.pair}: images are stamped {offset / 1e9:+.3f} s from their sweeps, "
+                "and were taken as they are listed"
+            )
+        if jumps:
+            notes.append(f"pair {account.pair}: stamps of its inputs jump {jumps} times")
         received, early = intake.account(account.pair)
         dropped = early + account.dropped
         if dropped:

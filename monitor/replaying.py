@@ -12,6 +12,7 @@ from monitor.outputs import Outputs, Surroundings, open_outputs, write_whole
 from monitor.outputs.summary import FILE_NAME, Summary
 from monitor.preparation import prepare
 from monitor.sources import open_source
+from monitor.status import State
 from pipeline.errors import InputError
 from pipeline.parameters import Parameters
 from pipeline.records import Floats
@@ -59,11 +60,11 @@ def replay(
         under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
         source = open_source(location)
         with OverBus(source, "replay") if over_zenoh else source as messages:
-            watch(under_watch, messages, messages.losses, stop, progress)
+            state = watch(under_watch, messages, messages.losses, stop, progress)
     finally:
         outputs.close()
     if outputs.losses:
-        raise _lost(out, outputs.losses)
+        raise _lost(out, outputs.losses, state)
     return Summary.model_validate_json((out / FILE_NAME).read_bytes())
 
 
@@ -80,13 +81,12 @@ def _opened(out: Path, vehicle: str, images_hz: float) -> Outputs:
         ) from error
 
 
-def _lost(out: Path, losses: Mapping[str, str]) -> InputError:
+def _lost(out: Path, losses: Mapping[str, str], state: State) -> InputError:
     """What to tell when files are missing; a summary that was written no longer says that all is there."""
     what = "; ".join(f"{name}: {why}" for name, why in losses.items())
-    path, state = out / FILE_NAME, "not told"
+    path = out / FILE_NAME
     try:
         written = Summary.model_validate_json(path.read_bytes())
-        state = written.state
         path.unlink()
         note = f"not everything could be written: {what}"
         marked = written.model_copy(update={"complete": False, "note": note})

@@ -182,6 +182,6 @@ def _values(six: Floats) -> AxisValues:
 
 
 def _matched(belief: Belief | None, label: str) -> int:
-    if belief is None or belief.lines is None:
+    if belief is None:
         return 0
-    return sum(1 for frame in belief.lines.matches for match in frame if match.cloud.label == label)
+    return sum(1 for frame in belief.matched for match in frame if match.cloud.label == label)

@@ -314,8 +314,8 @@ _OUTLIER_SIGMAS = 3.0
 def sensor_origin(cloud: PointCloud) -> Floats:
     """Where the sensor stands in the cloud's frame, float64 (3,), m; zero where it stands at the origin.
 
-    Rings are cones with one apex (PROBE 8): seen from there each keeps its elevation. A cloud that was moved to
-    the vehicle's frame shows its rings bent instead, which tells the way back.
+    Rings are cones with one apex (PROBE 8): seen from there each keeps its elevation. A cloud that was moved
+    to the vehicle's frame shows its rings bent instead, which tells the way back.
     """
     turn = spin_turns(cloud)[0]
     ring = _rings(dataclasses.replace(cloud, xyz=(cloud.xyz @ turn.T).astype(np.float32)))

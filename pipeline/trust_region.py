@@ -1,7 +1,7 @@
 """Minimising by trust-region BFGS: every step stays where the quadratic model may be believed.
 
-A line search leaves the basin that the blur of an image makes in a third of the windows (PROBE 1); a bound on the step
-does not.
+A line search leaves the basin that the blur of an image makes in a third of the windows (PROBE 1); a bound on
+the step does not.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ class SearchParameters:
 
     Attributes:
         most_steps: Steps at most.
-        least_step: It ends when a step is shorter; in alert units 0.003 deg, a tenth of the smallest sigma seen.
+        least_step: It ends when a step is shorter; in alert units 0.003 deg, a tenth of the least sigma.
     """
 
     most_steps: int = 40

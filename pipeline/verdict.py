@@ -74,7 +74,7 @@ class Memory:
         alarm_drift: Estimate (6,) of the last of them, or None.
         stirred_ns: Stamp of the first judgement with suspicion since the last one without.
         quiet_ns: Stamp of the last judgement without suspicion (at first: of the first data).
-        quiet_from_ns: Stamp of the oldest frame in that judgement's window (likewise): what moved late in a
+        quiet_from_ns: Since when a drift would have shown in that judgement (likewise): what moved late in a
             window does not show in it.
         monitored_ns: Stamp at which every required axis was last monitored (at first: of the first data).
         last_seen_ns: Per axis the stamp at which it was last observable, or None.
@@ -160,7 +160,7 @@ def advance(
     Args:
         memory: Before it.
         judgement: Of the window that ends now.
-        window_ns: Stamps of the window's oldest and newest frame; the newest is now.
+        window_ns: Since when a drift would have shown in the window, and its newest frame, which is now.
         required: Axes that must be monitored for 'healthy'.
         limits: float64 (6,), alert limits.
         parameters: Hysteresis and patience.

@@ -144,7 +144,7 @@ class Belief:
         lines: The line witness, or None likewise.
         edges_drift: Its testimony in vehicle axes, or None.
         lines_drift: Likewise.
-        matches: Lines matched in the newest frame that has lines.
+        matched: Lines matched in each frame of the window that has lines, heard or not.
     """
 
     judgement: Judgement
@@ -153,7 +153,7 @@ class Belief:
     lines: LineSolution | None
     edges_drift: Testimony | None
     lines_drift: Testimony | None
-    matches: tuple[LineMatch, ...]
+    matched: tuple[tuple[LineMatch, ...], ...]
 
 
 class Watch:
@@ -353,7 +353,7 @@ class Watch:
         self.memory = verdict.advance(
             self.memory,
             self.belief.judgement,
-            (min((*self.window_stamps, *self.line_stamps)), now_ns),
+            (self._shown_since(), now_ns),
             self.mount.required,
             self.mount.limits,
             self.parameters.verdict,
@@ -361,6 +361,11 @@ class Watch:
         return Findings(
             None, findings.cloud, findings.edge_points, findings.masks, findings.lines, judged=True
         )
+
+    def _shown_since(self) -> int:
+        """Stamp from which three quarters of the window's frames are: a drift in all of those would show."""
+        stamps = sorted(self.window_stamps or self.line_stamps)
+        return stamps[len(stamps) // 4]
 
     def _believe(self) -> Belief | None:
         """Solves the window, fuses the witnesses, tests the stored extrinsic."""
@@ -371,7 +376,8 @@ class Watch:
         floor = test.floor()
         feigned = np.mean([f.feigned for f in self._edge_frames] or [np.zeros(6)], axis=0)
         edges = self._solve_edges(B.T @ (floor + np.outer(feigned, feigned) + C_ref) @ B)
-        lines = self._solve_lines()
+        matched = self._solve_lines()
+        lines = matched if matched is not None and _testifies(matched) else None
         edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
         lines_drift = None
         if lines is not None:
@@ -405,7 +411,7 @@ class Watch:
             lines=lines,
             edges_drift=edges_drift,
             lines_drift=lines_drift,
-            matches=lines.matches[-1] if lines is not None else (),
+            matched=() if matched is None else matched.matches,
         )
 
     def _solve_edges(self, floor: Floats) -> EdgeSolution | None:
@@ -423,10 +429,14 @@ class Watch:
         if not frames:
             return None
         solution = line_witness.solve_lines(frames, self.mount.camera, self.mount.T_cam_lidar)
-        estimate = solution.estimate
-        within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
-        fits = estimate.frames >= _LINES_FRAMES and estimate.chi2 <= _LINES_MISFIT
-        return solution if fits and within else None
+        return solution if solution.estimate.features > 0 else None
+
+
+def _testifies(lines: LineSolution) -> bool:
+    """Whether matched lines may be heard: often enough, fitting each other, within reach of the matching."""
+    estimate = lines.estimate
+    within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
+    return within and estimate.frames >= _LINES_FRAMES and estimate.chi2 <= _LINES_MISFIT
 
 
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:

@@ -72,6 +72,7 @@ def command(
     else:
         tell(summary, out, images_hz)
     if not summary.complete:
+        click.echo(f"warning: {summary.note or 'interrupted'}", err=True)
         return commands.INTERRUPTED
     return exit_code(summary.state, exit_zero=exit_zero)
 

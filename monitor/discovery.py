@@ -155,7 +155,10 @@ def survey_in(messages: Iterable[Message | Tick], topics: Sequence[TopicInfo]) -
 
 def discover(survey: Survey) -> Discovery:
     """Pairs every cloud topic with every image topic whose frames tf connects."""
-    missing = [f"topic {topic}: {why}" for topic, why in sorted(survey.undecodable.items())]
+    missing = [
+        f"topic {topic}: {why.removeprefix(f'topic {topic}: ')}"
+        for topic, why in sorted(survey.undecodable.items())
+    ]
     if not survey.clouds:
         missing.append("no topic with point clouds")
     if not survey.images:

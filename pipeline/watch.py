@@ -223,7 +223,7 @@ class Watch:
         if self.belief is None and (self._edge_frames or self._line_frames):
             self.belief = self._believe()
         judgement = self.belief.judgement if self.belief is not None else None
-        self.memory = verdict.finish(self.memory, judgement, self.frames, self.mount.required)
+        self.memory = verdict.finish(self.memory, judgement, self._count, self.mount.required)
 
     def _enter(self, now_ns: int) -> None:
         """Brings clock and memory to a new pair; a clock that runs back starts a new window."""

@@ -1,5 +1,6 @@
 """``calibwatch replay``: a recording through the engine, files out."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,6 +94,5 @@ def tell(summary: "Summary", out: Path, images_hz: float) -> None:
         click.echo(f"warning: {warning}", err=True)
     recording = out / "recording.rrd"
     click.echo(f"report: {out / 'report.html'}")
-    click.echo(
-        f"recording: {recording} (images at {images_hz:g} Hz; open with: {commands.viewer()} {recording})"
-    )
+    opens = f"{commands.viewer()} {shlex.quote(str(recording))}"
+    click.echo(f"recording: {recording} (images at {images_hz:g} Hz; open with: {opens})")

@@ -81,9 +81,19 @@ def to_onnx(
             "model_version": version,
             "training_data_sha256": data_sha256,
         }
+        _forget_where_it_was_made(graph)
         onnx.helper.set_model_props(graph, said)
         onnx.save(graph, unfinished, save_as_external_data=False)
         unfinished.replace(out)
+
+
+def _forget_where_it_was_made(graph: onnx.ModelProto) -> None:
+    """Take out the exporter's stack traces: paths of this machine, and a tenth of the file."""
+    for node in graph.graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ""
+    for value in (*graph.graph.value_info, *graph.graph.input, *graph.graph.output):
+        del value.metadata_props[:]
 
 
 def main() -> None:

@@ -30,3 +30,7 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path):
         os.truncate(file.fileno(), 1 << 40)  # a hole: no disk is used
     with pytest.raises(ModelError, match="too many for a network"):
         model_bytes(path)
+
+
+def test_the_network_that_ships_names_no_file_of_the_machine_that_made_it():
+    assert b".py" not in model_bytes(None)

@@ -32,7 +32,8 @@ def command(*, out: Path, seed: int) -> int:
         click.echo(line)
     click.echo(f"report:    {out / 'report.html'} (open in a browser)")
     click.echo(f"recording: {out / 'recording.rrd'} (open with: {commands.viewer()} {out / 'recording.rrd'})")
-    click.echo(f"drive:     {out / 'drive.mcap'} (judge it again: calibwatch replay {out / 'drive.mcap'})")
+    drive, rig = out / "drive.mcap", out / "rig.toml"
+    click.echo(f"drive:     {drive} (judge it again: calibwatch replay {drive} --rig {rig})")
     if not told.summary.complete:
         return commands.INTERRUPTED
     return 0 if told.success else 1

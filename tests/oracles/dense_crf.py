@@ -28,8 +28,9 @@ def mean_field_exact(
     appearance: tuple[tuple[float, float], tuple[float, float, float], float] | None,
     iterations: int,
     class_weights: tuple[float, ...] | None = None,
+    region: NDArray[np.bool_] | None = None,
 ) -> Floats:
-    """Marginals (C,h,w) after the given number of parallel updates.
+    """Marginals (C,h,w) after the given number of parallel updates; outside ``region`` there are none.
 
     ``smoothness`` is (sigma xy, compat), ``appearance`` is (sigma xy, sigma colour, compat).
     """
@@ -50,7 +51,8 @@ def mean_field_exact(
         kernels.append((compat, normalised_kernel(features)))
     weights = np.ones(classes) if class_weights is None else np.array(class_weights)
     q = _softmax(minus_u)
+    moves = np.ones(q.shape[1], dtype=np.bool_) if region is None else region.ravel()
     for _ in range(iterations):
         pull = sum((compat * (q @ kernel) for compat, kernel in kernels), np.zeros_like(q))
-        q = _softmax(minus_u + weights[:, None] * pull)
+        q = np.where(moves, _softmax(minus_u + weights[:, None] * pull), q)
     return q.reshape(unary.shape)

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.crf import AppearanceKernel, CrfParameters, SmoothnessKernel, _numbered, mean_field
+from pipeline.crf import AppearanceKernel, CrfParameters, SmoothnessKernel, mean_field
 from pipeline.errors import InputError, RigError
+from pipeline.permutohedral import _numbered
 
 ROOT = Path(__file__).parents[2]
 _SPEC = importlib.util.spec_from_file_location("dense_crf", ROOT / "tests" / "oracles" / "dense_crf.py")
@@ -156,19 +157,40 @@ class TestAgainstBruteForce:
 
 
 class TestRegion:
+    SMOOTH = ((2.0, 2.0), 2.0)
     PARAMETERS = CrfParameters(
         SmoothnessKernel(2.0, 2.0, 2.0), AppearanceKernel(10.0, 10.0, (13.0,) * 3, 3.0)
     )
 
-    def test_half_an_image_is_the_image_of_that_half(self):
-        unary, image = random_scene(np.random.default_rng(11), 3, 30, 40)
-        region = np.zeros((30, 40), dtype=bool)
-        region[:, :17] = True
-        got = mean_field(unary, image, self.PARAMETERS, region)
-        cropped = mean_field(unary[:, :, :17], np.ascontiguousarray(image[:, :17]), self.PARAMETERS)
-        np.testing.assert_allclose(got[:, :, :17], cropped, atol=1e-5)
-        untouched = mean_field(unary, image, CrfParameters(None, None))
-        np.testing.assert_array_equal(got[:, :, 17:], untouched[:, :, 17:])
+    def test_smoothness_sees_the_pixels_that_stand_still(self):
+        rng = np.random.default_rng(11)
+        unary, image = random_scene(rng, 3, 30, 40)
+        region = rng.random((30, 40)) < 0.3
+        got = mean_field(unary, image, CrfParameters(SmoothnessKernel(2.0, 2.0, 2.0), None), region)
+        crf = {"smoothness": self.SMOOTH, "appearance": None, "iterations": 5}
+        exact = dense_crf.mean_field_exact(unary, image, **crf, region=region)
+        np.testing.assert_allclose(got, exact, atol=1e-4)
+        np.testing.assert_array_equal(
+            got[:, ~region], mean_field(unary, image, CrfParameters(None, None))[:, ~region]
+        )
+
+    # At 4 px every fixed pixel takes part, at 10 px every ninth stands for its neighbours.
+    @pytest.mark.parametrize(("sigma", "mean"), [(4.0, 0.006), (10.0, 0.012)])
+    def test_appearance_sees_the_pixels_that_stand_still(self, sigma, mean):
+        unary, image = random_scene(np.random.default_rng(12), 3, 44, 44)
+        region = np.zeros((44, 44), dtype=bool)
+        region[8:30, 10:24] = True
+        like = ((sigma, sigma), (14.0, 14.0, 14.0), 3.0)
+        got = mean_field(unary, image, CrfParameters(None, AppearanceKernel(*like[0], *like[1:])), region)
+        crf = {"smoothness": None, "appearance": like, "iterations": 5}
+        exact = dense_crf.mean_field_exact(unary, image, **crf, region=region)
+        alone = dense_crf.mean_field_exact(
+            np.ascontiguousarray(unary[:, 8:30, 10:24]), np.ascontiguousarray(image[8:30, 10:24]), **crf
+        )
+        deviation = np.abs(got - exact)[:, region].mean()
+        assert deviation < mean
+        # The pixels around matter: without them the answer is another one.
+        assert np.abs(alone - exact[:, 8:30, 10:24]).mean() > 2.0 * deviation
 
     def test_all_pixels_and_none(self):
         unary, image = random_scene(np.random.default_rng(12), 2, 16, 16)

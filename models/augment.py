@@ -71,12 +71,17 @@ def _window(
     return picture[top:bottom, left:right], label[top:bottom, left:right], (u - left, v - top)
 
 
+MONOCHROME = 0.08
+"""Share of pictures without colour: many cameras of vehicles have none."""
+
+
 def colour(picture: Picture, rng: np.random.Generator) -> Picture:
     """White balance, contrast, brightness, saturation and gamma."""
     x = picture.astype(np.float32)
     x *= rng.uniform(0.85, 1.15, 3).astype(np.float32)
     grey = x.mean(axis=2, keepdims=True)
-    x = grey + (x - grey) * np.float32(rng.uniform(0.0, 1.5))
+    saturation = 0.0 if rng.random() < MONOCHROME else rng.uniform(0.3, 1.5)
+    x = grey + (x - grey) * np.float32(saturation)
     x = (x - 110.0) * np.float32(rng.uniform(0.6, 1.4)) + np.float32(110.0 + rng.uniform(-35.0, 35.0))
     gamma = np.exp(rng.uniform(-0.5, 0.5))
     table = (255.0 * (np.arange(256) / 255.0) ** gamma).astype(np.uint8)
@@ -106,6 +111,34 @@ def night(picture: Picture, rng: np.random.Generator) -> Picture:
     return noise((picture * light[..., None] * tint).astype(np.uint8), rng, strongest=10.0)
 
 
+def haze(picture: Picture, rng: np.random.Generator) -> Picture:
+    """Lay a light veil over the picture, thicker to one side: fog, spray, a sunlit windscreen."""
+    height, width = picture.shape[:2]
+    corners = rng.uniform(0.0, 0.65, (2, 2)).astype(np.float32)
+    veil = cv2.resize(corners, (width, height), interpolation=cv2.INTER_LINEAR)[..., None]
+    light = np.float32(rng.uniform(110.0, 245.0)) * rng.uniform(0.93, 1.07, 3).astype(np.float32)
+    veiled: Picture = np.clip(picture * (1.0 - veil) + light * veil, 0.0, 255.0).astype(np.uint8)
+    return veiled
+
+
+def rain(picture: Picture, rng: np.random.Generator) -> Picture:
+    """Draw falling streaks, and drops on the glass that smear what lies behind them."""
+    height, width = picture.shape[:2]
+    streaks = np.zeros((height, width), np.uint8)
+    slant, length = rng.normal(0.0, 0.25), rng.uniform(6.0, 25.0)
+    for u, v in rng.uniform((0.0, 0.0), (width, height), (int(rng.integers(20, 160)), 2)):
+        end = round(u + slant * length), round(v + length * rng.uniform(0.5, 1.0))
+        cv2.line(streaks, (round(u), round(v)), end, 255, 1, cv2.LINE_AA)
+    share = cv2.GaussianBlur(streaks, (0, 0), 0.7)[..., None] * np.float32(rng.uniform(0.1, 0.35) / 255.0)
+    wet = picture + (200.0 - picture.astype(np.float32)) * share
+    drops = np.zeros((height, width), np.uint8)
+    for u, v in rng.uniform((0.0, 0.0), (width, height), (int(rng.integers(0, 8)), 2)):
+        cv2.circle(drops, (round(u), round(v)), int(rng.integers(2, 12)), 255, -1, cv2.LINE_AA)
+    behind = cv2.GaussianBlur(drops, (0, 0), 1.0)[..., None].astype(np.float32) / 255.0
+    smeared = cv2.GaussianBlur(wet, (0, 0), 5.0)
+    return np.clip(wet + (smeared - wet) * behind, 0.0, 255.0).astype(np.uint8)
+
+
 def blur(picture: Picture, rng: np.random.Generator) -> Picture:
     """Defocus, or the smear of motion along a random direction."""
     if rng.integers(2) == 0:
@@ -133,7 +166,16 @@ def jpeg(picture: Picture, rng: np.random.Generator) -> Picture:
     return picture if decoded is None else decoded.astype(np.uint8, copy=False)
 
 
-CHANCES = ((colour, 0.8), (shadow, 0.25), (night, 0.06), (blur, 0.2), (noise, 0.25), (jpeg, 0.2))
+CHANCES = (
+    (colour, 0.8),
+    (shadow, 0.25),
+    (haze, 0.1),
+    (night, 0.06),
+    (rain, 0.06),
+    (blur, 0.2),
+    (noise, 0.25),
+    (jpeg, 0.2),
+)
 """Each step with its chance, in the order in which light, lens, sensor and link act."""
 
 

@@ -39,11 +39,11 @@ class Widths:
         climb: Channels of the way back at 1/4 and 1/2.
     """
 
-    detail: tuple[int, int, int] = (24, 32, 64)
+    detail: tuple[int, int, int] = (16, 32, 64)
     semantic: tuple[int, int, int, int] = (16, 32, 64, 96)
     expansion: int = 4
     fused: int = 64
-    climb: tuple[int, int] = (32, 24)
+    climb: tuple[int, int] = (32, 16)
 
 
 def conv(

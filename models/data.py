@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from models import augment
+from models import augment, composite
 from pipeline import labels
 
 if TYPE_CHECKING:
@@ -178,6 +178,8 @@ class Sampler:
         weights: Set name -> share of the draws, relative; a set not named counts by the root of its size,
             so that a large set of one camera does not drown small ones.
         thin_share: Share of the crops that are centred on a thin class where the set has one.
+        paint_share: Share of the crops of a set with labelled road that get synthetic paint.
+        pole_share: Share of the crops that get a synthetic pole.
         widths: A picture is scaled so that its full width falls in this range, px, log-uniform: what the
             run time sees. Poles must keep their 2 to 5 px.
         largest_scale: Upper bound of the magnification: beyond it there is nothing but blur to learn.
@@ -190,6 +192,8 @@ class Sampler:
         weights: dict[str, float],
         *,
         thin_share: float = 0.75,
+        paint_share: float = 0.35,
+        pole_share: float = 0.3,
         widths: tuple[float, float] = (760.0, 1600.0),
         largest_scale: float = 2.0,
     ) -> None:
@@ -201,13 +205,14 @@ class Sampler:
         self._shares = shares / shares.sum()
         self._size = size
         self._thin_share = thin_share
+        self._paint_share, self._pole_share = paint_share, pole_share
         self._widths = widths
         self._largest_scale = largest_scale
         self._cache: dict[Path, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
         self._cached = 0
 
     def draw(self, rng: np.random.Generator) -> Crop:
-        """Draw one augmented crop."""
+        """Draw one augmented crop, at times with synthetic paint or a synthetic pole in it."""
         one = self._sets[int(rng.choice(len(self._sets), p=self._shares))]
         identifiers = one.splits["train"]
         picture, label = self._load(one, identifiers[int(rng.integers(len(identifiers)))])
@@ -216,8 +221,36 @@ class Sampler:
         stretch = np.exp(rng.uniform(-0.1, 0.1))
         scales = (float(scale * stretch), float(scale / stretch))
         centre = self._place(one, label, scales, rng)
-        crop, moved = augment.cut(picture, label, centre, scales, self._size, flip=bool(rng.integers(2)))
+        flip = bool(rng.integers(2))
+        crop, moved = augment.cut(picture, label, centre, scales, self._size, flip=flip)
+        ground = self._ground(label, centre, scales, rng, flip=flip)
+        if ground is not None and rng.random() < self._paint_share:
+            crop, moved = composite.paint(crop, moved, ground, rng)
+        if rng.random() < self._pole_share:
+            crop, moved = composite.pole(crop, moved, ground, rng)
         return Crop(augment.photometric(crop, rng), moved, one.groups)
+
+    def _ground(
+        self,
+        label: NDArray[np.uint8],
+        centre: tuple[float, float],
+        scales: tuple[float, float],
+        rng: np.random.Generator,
+        *,
+        flip: bool,
+    ) -> composite.Ground | None:
+        """Guess where the road vanishes in a crop: a little above its uppermost row, near the middle."""
+        highest = composite.highest_road(label)
+        if highest is None:
+            return None
+        height, width = label.shape
+        u, v = width * rng.normal(0.5, 0.12), highest - height * rng.uniform(0.0, 0.03)
+        along = (-1.0 if flip else 1.0) * scales[0] * (u - centre[0])
+        return composite.Ground(
+            u=(self._size[1] - 1) / 2 + along,
+            v=(self._size[0] - 1) / 2 + scales[1] * (v - centre[1]),
+            focal=width * scales[0] * rng.uniform(0.5, 1.4),
+        )
 
     def batch(
         self, count: int, rng: np.random.Generator

@@ -1,14 +1,15 @@
 """Train BiSeNetV2 on data in the fleet layout: ``python -m models.train --data DIR --out DIR --minutes N``.
 
 Checkpoints are written every few minutes and the same command goes on from the last one, also with more data
-or more minutes. The learning rate falls with the time spent, so that a run ends well whatever the machine.
+or more minutes. The learning rate is held, then falls over the last part of the time, so that a run ends well
+whatever the machine. What stands when the fall begins is kept too: ``--start`` lets another run, with other
+data, go on from there (a run that has ended has lost the rate to learn with).
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 CHECKPOINT = "checkpoint.pt"
+BEFORE_FALL = "before_fall.pt"
+"""Checkpoint of the moment at which the rate began to fall."""
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +42,7 @@ class Recipe:
         batch: Crops a step.
         rate: Highest learning rate of AdamW.
         decay: Weight decay of AdamW.
-        power: Exponent of the poly schedule.
+        fall: Last share of the time over which the rate falls to nothing.
         warm_up: Steps over which the rate rises.
         average: Decay of the running mean of the weights, which is what is exported.
         save_s: Seconds between checkpoints.
@@ -50,7 +53,7 @@ class Recipe:
     batch: int = 6
     rate: float = 2.5e-3
     decay: float = 0.01
-    power: float = 0.9
+    fall: float = 0.4
     warm_up: int = 100
     average: float = 0.998
     save_s: float = 120.0
@@ -102,12 +105,8 @@ def start(recipe: Recipe, device: torch.device) -> Run:
 
 
 def learning_rate(recipe: Recipe, step: int, progress: float) -> float:
-    """Poly schedule over the share of the time that is spent, after a linear rise."""
-    return (
-        recipe.rate
-        * min(1.0, (step + 1) / recipe.warm_up)
-        * math.pow(max(1.0 - progress, 1e-3), recipe.power)
-    )
+    """Rise over the first steps, hold, fall linearly over the last share of the time."""
+    return recipe.rate * min(1.0, (step + 1) / recipe.warm_up, max(1.0 - progress, 1e-3) / recipe.fall)
 
 
 def update_average(average: torch.nn.Module, network: torch.nn.Module, decay: float, step: int) -> None:
@@ -144,8 +143,13 @@ def train(
     began = saved = clock()
     before = run.spent_s
     losses_seen: list[float] = []
+    falling = before >= (1.0 - recipe.fall) * 60.0 * minutes
     while run.spent_s < 60.0 * minutes:
-        rate = learning_rate(recipe, run.step, run.spent_s / (60.0 * minutes))
+        progress = run.spent_s / (60.0 * minutes)
+        if not falling and progress >= 1.0 - recipe.fall:
+            run.save(out / BEFORE_FALL, data)
+            falling = True
+        rate = learning_rate(recipe, run.step, progress)
         for group in run.optimiser.param_groups:
             group["lr"] = rate
         rgb, label, groups = sampler.batch(recipe.batch, rng)
@@ -196,6 +200,9 @@ def main() -> None:
     parser.add_argument(
         "--weight", type=_weight, action="append", default=[], metavar="SET=W", help="share of draws"
     )
+    parser.add_argument(
+        "--start", type=Path, metavar="FILE", help="checkpoint whose weights a new run begins with"
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of the processor")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -210,6 +217,9 @@ def main() -> None:
     run = start(recipe, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
     if (options.out / CHECKPOINT).is_file():
         run.load(options.out / CHECKPOINT)
+    elif options.start is not None:
+        run.load(options.start)
+        run.step, run.spent_s = 0, 0.0
     sampler = Sampler(sets, recipe.crop, dict(options.weight))
     train(
         run,

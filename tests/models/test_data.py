@@ -126,7 +126,15 @@ def test_crops_seek_thin_things_and_keep_picture_and_label_together(tmp_path, mo
     """Paint is the bright and the pole the dark of these pictures: so it must be after the geometry alone."""
     monkeypatch.setattr(data.augment, "CHANCES", ())
     write_set(tmp_path / "a", size=(240, 400))
-    sampler = Sampler(read_sets([tmp_path]), (64, 64), {}, thin_share=1.0, widths=(300.0, 600.0))
+    sampler = Sampler(
+        read_sets([tmp_path]),
+        (64, 64),
+        {},
+        thin_share=1.0,
+        widths=(300.0, 600.0),
+        paint_share=0.0,
+        pole_share=0.0,
+    )
     rng = np.random.default_rng(6)
     seen = 0
     for _ in range(60):
@@ -150,3 +158,28 @@ def test_weights_say_how_often_a_set_is_drawn(tmp_path):
     assert 120 < marked < 180
     with pytest.raises(DataError, match="fog"):
         Sampler(read_sets([tmp_path]), (32, 32), {"fog": 1.0})
+
+
+def test_synthetic_marks_are_drawn_where_road_is_known(tmp_path):
+    """A set without paint gets some, as often as asked, and its poles too."""
+    folder = write_set(tmp_path / "a", size=(240, 400), said={"labelled_classes": [0, 1, 2, 3]})
+    for file in (folder / "labels").iterdir():
+        label = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        label[:] = labels.OTHER
+        label[100:] = labels.ROAD
+        cv2.imwrite(str(file), label)
+    sets = read_sets([tmp_path])
+
+    def shares(**chances):
+        sampler = Sampler(sets, (128, 192), {}, widths=(300.0, 600.0), **chances)
+        rng = np.random.default_rng(3)
+        crops = [sampler.draw(rng).label for _ in range(60)]
+        return [np.mean([(crop == value).sum() > 20 for crop in crops]) for value in data.THIN]
+
+    assert shares(paint_share=0.0, pole_share=0.0) == [0.0, 0.0]
+    lane, pole = shares(paint_share=1.0, pole_share=0.0)
+    assert lane > 0.4
+    assert pole == 0.0
+    lane, pole = shares(paint_share=0.0, pole_share=1.0)
+    assert lane == 0.0
+    assert pole > 0.5

@@ -78,12 +78,13 @@ def test_export_is_one_file_that_the_run_time_accepts_and_agrees_with(network, t
         assert np.abs(got - expected[:, : got.shape[1], : got.shape[2]]).max() < 1e-4
 
 
-def test_rate_rises_then_falls_to_the_end_of_the_time():
-    recipe = train.Recipe(rate=1.0, warm_up=10, power=1.0)
+def test_rate_rises_is_held_and_falls_to_the_end_of_the_time():
+    recipe = train.Recipe(rate=1.0, warm_up=10, fall=0.4)
     assert train.learning_rate(recipe, 0, 0.0) == pytest.approx(0.1)
     assert train.learning_rate(recipe, 9, 0.0) == pytest.approx(1.0)
-    assert train.learning_rate(recipe, 500, 0.25) == pytest.approx(0.75)
-    assert train.learning_rate(recipe, 500, 1.0) == pytest.approx(1e-3)
+    assert train.learning_rate(recipe, 500, 0.6) == pytest.approx(1.0)
+    assert train.learning_rate(recipe, 500, 0.8) == pytest.approx(0.5)
+    assert train.learning_rate(recipe, 500, 1.0) == pytest.approx(0.0025)
 
 
 def test_average_is_the_running_mean():
@@ -117,8 +118,9 @@ def _folder(tmp_path):
 def test_training_learns_resumes_and_keeps_to_its_time(tmp_path):
     """A clock that ticks one second a look: 30 s are 30 steps, and a second call goes on from there."""
     torch.manual_seed(0)
-    recipe = train.Recipe(crop=(64, 64), batch=2, warm_up=5, save_s=7.0, rate=5e-3)
-    sampler = Sampler(read_sets([_folder(tmp_path)]), recipe.crop, {}, widths=(90.0, 130.0))
+    recipe = train.Recipe(crop=(64, 64), batch=2, warm_up=5, save_s=7.0, rate=5e-3, fall=0.8)
+    sets = read_sets([_folder(tmp_path)])
+    sampler = Sampler(sets, recipe.crop, {}, widths=(90.0, 130.0), paint_share=0.0, pole_share=0.0)
     device = torch.device("cpu")
 
     def go_on(minutes):
@@ -140,8 +142,13 @@ def test_training_learns_resumes_and_keeps_to_its_time(tmp_path):
 
     first = go_on(0.25)
     assert (first.step, first.spent_s) == (15, 15.0)
+    before_fall = train.start(recipe, device)
+    before_fall.load(tmp_path / train.BEFORE_FALL)
+    assert before_fall.step == 3
     second = go_on(0.5)
     assert (second.step, second.spent_s) == (30, 30.0)
+    before_fall.load(tmp_path / train.BEFORE_FALL)
+    assert before_fall.step == 3  # 15 of 30 s: the rate was falling already
     assert not list(tmp_path.glob("*.tmp"))
     rgb, label, _ = sampler.batch(4, np.random.default_rng(3))
     with torch.no_grad():

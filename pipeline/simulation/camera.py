@@ -31,7 +31,7 @@ _NEAR_M = 0.05
 _TONE_STEP = 0.25
 """Relative step of brightness between neighbours that counts as a border (window, shadow); grain is less."""
 _GAMMA = 1.0 / 2.2
-_RANK = np.array([0, 8, 7, 2, 3, 1, 4, 0, 6], dtype=np.int32)
+_RANK = np.array([0, 8, 7, 2, 3, 1, 4, 0, 6, -1], dtype=np.int32)
 """Which class wins a pixel that is shared evenly: the thinner one."""
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 2]
 
@@ -67,6 +67,8 @@ class Look:
         vignetting: Loss of light in the corners, 0..1.
         noise: Standard deviation at mid grey, grey levels.
         tint: Gain of blue, green, red.
+        bloom: Share of the light that the glass scatters widely.
+        veil: Light that haze on the glass adds everywhere, relative to white.
     """
 
     grey: float = 105.0
@@ -74,6 +76,8 @@ class Look:
     vignetting: float = 0.25
     noise: float = 1.8
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    bloom: float = 0.0
+    veil: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,16 +138,16 @@ def render(
         rng: Noise.
     """
     solids = scene.solids_at(time)
-    focal = float(optics.camera.K[0, 0])
+    focal, R = float(optics.camera.K[0, 0]), T_world_cam[:3, :3]
     windows = _windows(solids, optics, T_world_cam)
     rays = _rays(optics.rays[0], T_world_cam)
     hits = cast(scene, solids, rays, windows)
-    radiance, classes = shade(View(scene, solids, rays, hits, shadows, focal))
+    radiance, classes = shade(View(scene, solids, rays, hits, shadows, focal, R))
     column, row = np.nonzero(_busy(radiance, classes, hits).T)
     xy = optics.rays[1:, :, row, column].transpose(1, 2, 0).reshape(2, 1, -1)
     more = _rays(xy, T_world_cam)
     more_hits = cast(scene, solids, more, _listed(hits.tested, column))
-    colour, more_classes = shade(View(scene, solids, more, more_hits, shadows, focal))
+    colour, more_classes = shade(View(scene, solids, more, more_hits, shadows, focal, R))
     per_pixel = len(GRID) - 1
     total = radiance[:, row, column] + colour.reshape(3, -1, per_pixel).sum(axis=2)
     radiance[:, row, column] = total / np.float32(len(GRID))
@@ -218,10 +222,11 @@ def _extent(flags: NDArray[np.bool_]) -> slice:
 
 
 def _voted(votes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The class with most votes in each row of (N,4), the thinner one of equals."""
-    score = np.stack([16 * (votes == k).sum(axis=1) + _RANK[k] for k in range(len(labels.NAMES))])
+    """The class with most votes in each row of (N,4), the thinner one of equals; what is unsure comes last."""
+    candidates = np.array([*range(len(labels.NAMES)), labels.IGNORE], dtype=np.uint8)
+    score = np.stack([16 * (votes == k).sum(axis=1) + r for k, r in zip(candidates, _RANK, strict=True)])
     # A class without a vote must not win by its rank.
-    return np.asarray(np.argmax(np.where(score >= 16, score, -1), axis=0), dtype=np.uint8)
+    return candidates[np.argmax(np.where(score >= 16, score, -1), axis=0)]
 
 
 def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -232,11 +237,22 @@ def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[n
     v, u = np.linspace(-1, 1, height, dtype=np.float32), np.linspace(-1, 1, width, dtype=np.float32)
     light *= (1.0 - np.float32(look.vignetting / 2) * (u[None, :] ** 2 + v[:, None] ** 2))[:, :, None]
     gain = _exposure(light[::4, ::4], look.grey)
+    if look.bloom > 0.0 or look.veil > 0.0:
+        light = _scattered(light, gain, look)
     grey = np.clip(gain * light, 0.0, 1.0) ** np.float32(_GAMMA) * np.float32(255.0)
     grain = rng.standard_normal(grey.shape, dtype=np.float32)
     # Shot noise after the tone curve: about even over the grey levels, a little stronger in the dark.
     grey += np.float32(look.noise) * grain * (1.2 - grey * np.float32(0.4 / 255.0))
     return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
+
+
+def _scattered(light: F32, gain: np.float32, look: Look) -> F32:
+    """Light (H,W,3) with halos about what is too bright, and a veil."""
+    height, width = light.shape[:2]
+    small = cv2.resize(np.minimum(light, 12.0 / gain), (width // 4, height // 4), interpolation=cv2.INTER_AREA)
+    halo = cv2.GaussianBlur(small, (0, 0), 0.004 * width) + cv2.GaussianBlur(small, (0, 0), 0.02 * width)
+    wide = cv2.resize(halo, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(light + 0.5 * look.bloom * wide + look.veil / gain, dtype=np.float32)
 
 
 def _exposure(light: F32, target: float) -> np.float32:

@@ -34,7 +34,7 @@ WALL_COLOURS: tuple[Colour, ...] = (
 )
 
 
-def _pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 0.25) -> Colour:
+def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 0.25) -> Colour:
     """One of the colours, a little brighter or darker."""
     b, g, r = colours[int(rng.integers(len(colours)))]
     k = float(np.exp(rng.normal(0.0, spread)))
@@ -45,7 +45,7 @@ def _up(height: float) -> Floats:
     return np.array([0.0, 0.0, height])
 
 
-def _bar(
+def bar(
     start: Floats, end: Floats, radius: float, label: int, colour: Colour, *, reflectance: float
 ) -> Solid:
     """A cylinder between two points."""
@@ -63,7 +63,7 @@ def post(
     """A bare pole; ``lean`` forward and left in rad of the world's axes."""
     axes = upright(0.0, lean)
     foot = ground - 0.2 * axes[:, 2]
-    return _bar(foot, ground + height * axes[:, 2], radius, labels.POLE, colour, reflectance=0.35)
+    return bar(foot, ground + height * axes[:, 2], radius, labels.POLE, colour, reflectance=0.35)
 
 
 def lamp_post(
@@ -71,7 +71,7 @@ def lamp_post(
 ) -> list[Solid]:
     """A lamp post of 5 to 8 m whose arm reaches over the road; ``side`` is +1 left of the road, -1 right."""
     height, radius = float(rng.uniform(5.0, 8.0)), float(rng.uniform(0.06, 0.13))
-    colour = _pick(rng, (GREY_STEEL, (0.30, 0.30, 0.29), (0.08, 0.10, 0.07)))
+    colour = pick(rng, (GREY_STEEL, (0.30, 0.30, 0.29), (0.08, 0.10, 0.07)))
     mast = post(ground, height, radius, lean, colour)
     if rng.random() < 0.3:
         return [mast]
@@ -87,7 +87,7 @@ def lamp_post(
         colour,
         0.3,
     )
-    return [mast, _bar(top, end, 0.045, labels.POLE, colour, reflectance=0.35), head]
+    return [mast, bar(top, end, 0.045, labels.POLE, colour, reflectance=0.35), head]
 
 
 def sign_post(
@@ -114,7 +114,7 @@ def sign_post(
                 turned,
                 size,
                 labels.SIGN,
-                _pick(rng, SIGN_COLOURS, 0.1),
+                pick(rng, SIGN_COLOURS, 0.1),
                 0.95,
                 Material.PLATE,
             )
@@ -151,16 +151,16 @@ def tree(ground: Floats, rng: np.random.Generator) -> list[Solid]:
     lean = tuple(rng.normal(0.0, 0.04, 2))
     up = upright(0.0, (float(lean[0]), float(lean[1])))[:, 2]
     foot, fork = ground - 0.2 * up, ground + (height + 1.0) * up
-    trunk = _bar(foot, fork, radius, labels.VEGETATION, (0.05, 0.08, 0.11), reflectance=0.3)
+    trunk = bar(foot, fork, radius, labels.VEGETATION, (0.05, 0.08, 0.11), reflectance=0.3)
     crown = float(rng.uniform(1.4, 2.8))
     middle = ground + (height + 0.8 * crown) * up
-    green = _pick(rng, ((0.03, 0.12, 0.05), (0.02, 0.09, 0.06), (0.03, 0.14, 0.10)), 0.3)
+    green = pick(rng, ((0.03, 0.12, 0.05), (0.02, 0.09, 0.06), (0.03, 0.14, 0.10)), 0.3)
     return [trunk, *_foliage(middle, np.array([crown, crown, crown]), 5, green, rng)]
 
 
 def bush(ground: Floats, size: float, rng: np.random.Generator) -> list[Solid]:
     """A bush of two or three balls."""
-    green = _pick(rng, ((0.03, 0.11, 0.05), (0.03, 0.09, 0.07)), 0.3)
+    green = pick(rng, ((0.03, 0.11, 0.05), (0.03, 0.09, 0.07)), 0.3)
     return _foliage(ground + _up(0.6 * size), np.array([size, size, 0.7 * size]), 2, green, rng)
 
 
@@ -180,7 +180,7 @@ def _foliage(
                 axes,
                 size,
                 labels.VEGETATION,
-                _pick(rng, (green,), 0.15),
+                pick(rng, (green,), 0.15),
                 0.35,
                 Material.LEAVES,
             )
@@ -193,7 +193,7 @@ def building(
 ) -> list[Solid]:
     """A block of (length, depth, height) m around ``ground`` with windows and a roof edge."""
     length, depth, height = size
-    wall = _pick(rng, WALL_COLOURS)
+    wall = pick(rng, WALL_COLOURS)
     axes = upright(heading)
     up = axes[:, 2]
     block = Solid(
@@ -212,7 +212,7 @@ def building(
         axes,
         np.array([length / 2 + 0.3, depth / 2 + 0.3, 0.15]),
         labels.CONSTRUCTION,
-        _pick(rng, ((0.08, 0.09, 0.13), (0.06, 0.08, 0.22)), 0.1),
+        pick(rng, ((0.08, 0.09, 0.13), (0.06, 0.08, 0.22)), 0.1),
         0.25,
     )
     return [block, roof]
@@ -240,7 +240,7 @@ def car(rng: np.random.Generator) -> list[Solid]:
     """A passenger car about 4.3 m long in its own frame: x forward, origin on the ground below its middle."""
     length, width = float(rng.uniform(3.8, 4.8)), float(rng.uniform(1.65, 1.85))
     waist, roof = float(rng.uniform(0.85, 1.0)), float(rng.uniform(1.4, 1.75))
-    paint = _pick(rng, CAR_COLOURS)
+    paint = pick(rng, CAR_COLOURS)
     back = float(rng.uniform(0.36, 0.49))
     gloss = float(rng.uniform(0.1, 0.5))
     front_of_cabin = float(rng.uniform(0.16, 0.28))
@@ -263,7 +263,7 @@ def car(rng: np.random.Generator) -> list[Solid]:
 def van(rng: np.random.Generator) -> list[Solid]:
     """A van or lorry of 5 to 8 m in its own frame."""
     length, width, height = (float(rng.uniform(*r)) for r in ((5.0, 8.0), (1.95, 2.4), (2.2, 3.3)))
-    paint = _pick(rng, (*CAR_COLOURS, (0.75, 0.75, 0.75), (0.75, 0.75, 0.75)))
+    paint = pick(rng, (*CAR_COLOURS, (0.75, 0.75, 0.75), (0.75, 0.75, 0.75)))
     cab = 1.7
     return [
         _part(
@@ -326,7 +326,7 @@ def _lamps_and_plate(length: float, width: float, height: float) -> list[Solid]:
 
 def person(ground: Floats, rng: np.random.Generator) -> list[Solid]:
     """Somebody standing: two legs, trunk, head."""
-    cloth = _pick(rng, ((0.03, 0.03, 0.03), (0.2, 0.08, 0.05), (0.05, 0.05, 0.3), (0.3, 0.3, 0.3)))
+    cloth = pick(rng, ((0.03, 0.03, 0.03), (0.2, 0.08, 0.05), (0.05, 0.05, 0.3), (0.3, 0.3, 0.3)))
     axes = upright(float(rng.uniform(0.0, 2.0 * math.pi)))
     height = float(rng.uniform(1.55, 1.9))
     shapes = (

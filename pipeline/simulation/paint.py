@@ -1,4 +1,4 @@
-"""Paint on the road, in road coordinates: longitudinal lines, and patches (bars, arrows)."""
+"""Paint on the road, in road coordinates: longitudinal lines, patches (bars, arrows) and slanting strokes."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.surface import F32
+
+WHITE, YELLOW = 1, 2
+"""Colours of paint; 0 is none."""
+_MANY = 24
+"""Patches and strokes from which sorting the points once is quicker than looking at all of them each time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,6 +23,7 @@ class Line:
         dash: Length of a dash, m; 0 for a solid line.
         gap: Length of a gap, m.
         phase: Arc length at which a dash begins, m.
+        colour: WHITE or YELLOW.
     """
 
     d: float
@@ -25,6 +31,7 @@ class Line:
     dash: float = 0.0
     gap: float = 0.0
     phase: float = 0.0
+    colour: int = WHITE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,34 +42,83 @@ class Patch:
         s: First and last arc length, m.
         d: Middle, m.
         half: Half width at the first and at the last arc length, m.
+        colour: WHITE or YELLOW.
     """
 
     s: tuple[float, float]
     d: float
     half: tuple[float, float]
+    colour: int = WHITE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stroke:
+    """A straight stroke of any direction: hatching, letters, a line that leaves its lane.
+
+    Attributes:
+        start: Arc length and distance to the left of the first end, m.
+        end: Of the last end, m.
+        width: Across the stroke, m.
+        colour: WHITE or YELLOW.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    width: float
+    colour: int = WHITE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paint:
-    """Everything painted on a road."""
+    """Everything painted on a road; what comes later lies on top."""
 
     lines: tuple[Line, ...]
     patches: tuple[Patch, ...]
+    strokes: tuple[Stroke, ...] = ()
 
     def covers(self, s: F32, d: F32) -> NDArray[np.bool_]:
         """Whether road coordinates (N,), m, lie on paint."""
-        covered = np.zeros(s.shape, dtype=np.bool_)
+        return self.colours(s, d) > 0
+
+    def colours(self, s: F32, d: F32) -> NDArray[np.uint8]:
+        """Colour of the paint at road coordinates (N,), m; 0 where there is none."""
+        found = np.zeros(s.shape, dtype=np.uint8)
         for line in self.lines:
             near = np.flatnonzero(np.abs(d - np.float32(line.d)) < line.width / 2)
             if line.dash > 0.0:
                 near = near[np.mod(s[near] - np.float32(line.phase), line.dash + line.gap) < line.dash]
-            covered[near] = True
+            found[near] = line.colour
+        within = _Within(s, many=len(self.patches) + len(self.strokes) >= _MANY)
         for patch in self.patches:
-            near = np.flatnonzero((s > patch.s[0]) & (s < patch.s[1]))
+            near = within.between(*patch.s)
             share = (s[near] - np.float32(patch.s[0])) / np.float32(patch.s[1] - patch.s[0])
             half = patch.half[0] + share * (patch.half[1] - patch.half[0])
-            covered[near[np.abs(d[near] - np.float32(patch.d)) < half]] = True
-        return covered
+            found[near[np.abs(d[near] - np.float32(patch.d)) < half]] = patch.colour
+        for stroke in self.strokes:
+            way = np.subtract(stroke.end, stroke.start)
+            length = max(float(np.hypot(*way)), 1e-6)
+            first, last = sorted((stroke.start[0], stroke.end[0]))
+            near = within.between(first - stroke.width / 2, last + stroke.width / 2)
+            ds, dd = s[near] - np.float32(stroke.start[0]), d[near] - np.float32(stroke.start[1])
+            along = (ds * np.float32(way[0]) + dd * np.float32(way[1])) / np.float32(length)
+            across = np.abs(ds * np.float32(way[1]) - dd * np.float32(way[0])) / np.float32(length)
+            found[near[(along > 0) & (along < length) & (across < stroke.width / 2)]] = stroke.colour
+        return found
+
+
+class _Within:
+    """Which points lie between two arc lengths; a life of one look-up, sorted where that pays."""
+
+    def __init__(self, s: F32, *, many: bool) -> None:
+        self._s = s
+        self._order = np.argsort(s) if many else None
+        self._sorted = s if self._order is None else s[self._order]
+
+    def between(self, first: float, last: float) -> NDArray[np.int64]:
+        if self._order is None:
+            return np.flatnonzero((self._s > first) & (self._s < last))
+        a, b = np.searchsorted(self._sorted, np.array([first, last], dtype=np.float32))
+        return np.asarray(self._order[a:b])
 
 
 def crossing(s: float, right: float, left: float) -> tuple[Patch, ...]:

@@ -2,7 +2,7 @@
 # ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,9 +10,11 @@ from pipeline import labels
 from pipeline.records import Floats, read_only
 from pipeline.simulation import furniture
 from pipeline.simulation.paint import Line, Paint, Patch, arrow, crossing
+from pipeline.simulation.roadway import Roadway
 from pipeline.simulation.solids import Solid, Solids, upright
 from pipeline.simulation.surface import RoadSurface, draw_surface
 from pipeline.simulation.textures import Textures, draw_textures
+from pipeline.simulation.weather import Weather
 
 PARKING_M = 2.2
 """m; strip for parked vehicles at each side of a street in town."""
@@ -120,6 +122,8 @@ class Scene:
         textures: Noise tables.
         asphalt: Albedo of the road, 0..1.
         ego_left: Middle of the lane of the own vehicle, m to the left of the centre line.
+        roadway: What the road is made of and bears besides paint.
+        weather: Hour and weather.
     """
 
     surface: RoadSurface
@@ -131,6 +135,8 @@ class Scene:
     textures: Textures
     asphalt: float
     ego_left: float
+    roadway: Roadway = field(default_factory=Roadway)
+    weather: Weather = field(default_factory=Weather)
 
     def solids_at(self, time: float) -> Solids:
         """All solids as they stand at ``time`` s, the standing ones first."""
@@ -169,7 +175,7 @@ def draw_scene(parameters: SceneParameters, rng: np.random.Generator) -> Scene:
         solids += _roadside(surface, p, side, crossings, rng)
         solids += _background(surface, p, side, rng)
         if p.town:
-            solids += _parked(surface, p, side, crossings, rng)
+            solids += parked(surface, p, side, crossings, rng)
     solids += _horizon(surface, p, rng)
     azimuth = rng.uniform(0.0, 2.0 * math.pi)
     sun = np.array([math.cos(azimuth), math.sin(azimuth), math.tan(p.sun_elevation)])
@@ -181,7 +187,7 @@ def draw_scene(parameters: SceneParameters, rng: np.random.Generator) -> Scene:
         _paint(p, crossings, rng),
         p.wear,
         Solids.of(solids),
-        _traffic(p, forward, rng),
+        traffic(p, forward, rng),
         light,
         draw_textures(rng),
         float(rng.uniform(0.07, 0.13)),
@@ -227,13 +233,13 @@ def _lean(p: SceneParameters, rng: np.random.Generator) -> tuple[float, float]:
     return float(a), float(b)
 
 
-def _places(p: SceneParameters, spacing: float, rng: np.random.Generator, jitter: float = 0.2) -> list[float]:
+def places_along(p: SceneParameters, spacing: float, rng: np.random.Generator, jitter: float = 0.2) -> list[float]:
     """Arc lengths of things that stand at about regular distances."""
     s = np.arange(-BEHIND_M + rng.uniform(0.0, spacing), p.length, spacing)
     return list(s + rng.uniform(-jitter, jitter, len(s)) * spacing)
 
 
-def _ground(surface: RoadSurface, s: float, left: float) -> tuple[Floats, float]:
+def ground_at(surface: RoadSurface, s: float, left: float) -> tuple[Floats, float]:
     """Place on the ground beside the road, kerb height included, and heading."""
     place, heading, _ = surface.pose(s, left)
     place[2] += surface.kerb_height if not surface.kerb_right < left < surface.kerb_left else 0.0
@@ -246,26 +252,26 @@ def _roadside(
     """Lamp posts, signs, signals, bollards, trees and people along one side."""
     kerb = surface.kerb_left
     solids: list[Solid] = []
-    for s in _places(p, p.lamp_spacing, rng, 0.05):
-        place, heading = _ground(surface, s, side * (kerb + 0.5))
+    for s in places_along(p, p.lamp_spacing, rng, 0.05):
+        place, heading = ground_at(surface, s, side * (kerb + 0.5))
         solids += furniture.lamp_post(place, heading, side, _lean(p, rng), rng)
-    for s in _places(p, p.sign_spacing, rng):
-        place, heading = _ground(surface, s, side * (kerb + rng.uniform(0.4, 1.0)))
+    for s in places_along(p, p.sign_spacing, rng):
+        place, heading = ground_at(surface, s, side * (kerb + rng.uniform(0.4, 1.0)))
         solids += furniture.sign_post(place, heading, _lean(p, rng), rng)
     for s in crossings:
-        place, heading = _ground(surface, s - 1.5, side * (kerb + 0.4))
+        place, heading = ground_at(surface, s - 1.5, side * (kerb + 0.4))
         if rng.random() < 0.6:
             solids += furniture.traffic_light(place, heading, rng)
-    for s in _places(p, p.tree_spacing, rng):
+    for s in places_along(p, p.tree_spacing, rng):
         beyond = surface.pavement - 0.8 if p.town else rng.uniform(2.0, 9.0)
-        solids += furniture.tree(_ground(surface, s, side * (kerb + beyond))[0], rng)
+        solids += furniture.tree(ground_at(surface, s, side * (kerb + beyond))[0], rng)
     if p.town:
-        for s in _places(p, 25.0, rng, 0.5):
-            place, _ = _ground(surface, s, side * (kerb + rng.uniform(0.6, surface.pavement)))
+        for s in places_along(p, 25.0, rng, 0.5):
+            place, _ = ground_at(surface, s, side * (kerb + rng.uniform(0.6, surface.pavement)))
             solids += furniture.person(place, rng)
         start = float(rng.uniform(0.0, p.length))
         for s in np.arange(start, start + 20.0, 2.2):
-            place, _ = _ground(surface, float(s), side * (kerb + 0.35))
+            place, _ = ground_at(surface, float(s), side * (kerb + 0.35))
             solids.append(furniture.post(place, 0.95, 0.05, _lean(p, rng), (0.3, 0.3, 0.3)))
     return solids
 
@@ -281,10 +287,10 @@ def _background(
         length, height = float(rng.uniform(9.0, 24.0)), float(rng.uniform(6.0, 18.0))
         depth = float(rng.uniform(8.0, 12.0))
         setback = float(rng.choice([0.3, 2.5, 5.0]))
-        place, heading = _ground(surface, s + length / 2, side * (front + setback + depth / 2))
+        place, heading = ground_at(surface, s + length / 2, side * (front + setback + depth / 2))
         solids += furniture.building(place, heading, (length, depth, height), rng)
         if setback > 1.0:
-            place, heading = _ground(surface, s + length / 2, side * (front + 0.25))
+            place, heading = ground_at(surface, s + length / 2, side * (front + 0.25))
             hedge = bool(rng.random() < 0.5)
             label = labels.VEGETATION if hedge else labels.CONSTRUCTION
             colour = (0.03, 0.09, 0.05) if hedge else (0.3, 0.33, 0.36)
@@ -296,12 +302,12 @@ def _background(
     railed = rng.random() < 0.5
     for s in np.arange(-BEHIND_M, p.length, 4.0):
         if railed:
-            place, heading = _ground(surface, float(s), side * (surface.kerb_left + 0.6))
+            place, heading = ground_at(surface, float(s), side * (surface.kerb_left + 0.6))
             rail = furniture.panel(place, heading, (4.1, 0.06, 0.31), (0.4, 0.4, 0.4), labels.CONSTRUCTION)
             solids.append(_raised(rail, 0.45))
             solids.append(furniture.post(place, 0.7, 0.05, (0.0, 0.0)))
         if rng.random() < 0.35:
-            place, _ = _ground(surface, float(s), side * (surface.kerb_left + rng.uniform(2.5, 14.0)))
+            place, _ = ground_at(surface, float(s), side * (surface.kerb_left + rng.uniform(2.5, 14.0)))
             solids += furniture.bush(place, float(rng.uniform(0.6, 2.0)), rng)
     return solids
 
@@ -323,12 +329,12 @@ def _horizon(surface: RoadSurface, p: SceneParameters, rng: np.random.Generator)
     """A far belt of trees, so that the street does not end in the sky."""
     solids: list[Solid] = []
     for left in np.arange(-150.0, 151.0, 12.0):
-        place, _ = _ground(surface, p.length + 20.0 + float(rng.uniform(0.0, 15.0)), float(left))
+        place, _ = ground_at(surface, p.length + 20.0 + float(rng.uniform(0.0, 15.0)), float(left))
         solids += furniture.bush(place, float(rng.uniform(5.0, 9.0)), rng)
     return solids
 
 
-def _parked(
+def parked(
     surface: RoadSurface, p: SceneParameters, side: float, crossings: list[float], rng: np.random.Generator
 ) -> list[Solid]:
     """Parked vehicles beside the kerb, none near a crossing."""
@@ -358,7 +364,7 @@ def _parked(
     return solids
 
 
-def _traffic(p: SceneParameters, forward: int, rng: np.random.Generator) -> tuple[Mover, ...]:
+def traffic(p: SceneParameters, forward: int, rng: np.random.Generator) -> tuple[Mover, ...]:
     """Vehicles in every lane but the own one: those that come towards us, and those beside us."""
     edge = p.lanes * p.lane_width / 2
     lanes = [k for k in range(p.lanes) if k > 0]

@@ -7,23 +7,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import labels
+from pipeline.records import Floats
+from pipeline.simulation.materials import Surfaces, glows, lots_of, paint_materials
+from pipeline.simulation.paint import YELLOW
 from pipeline.simulation.raycast import Hits, SolidPoints, places, solid_points
 from pipeline.simulation.scene import Scene
 from pipeline.simulation.shadows import ShadowMap, shaded_by_movers
 from pipeline.simulation.solids import Material, Solids
 from pipeline.simulation.surface import F32, KERB, RAISED, SKY, Rays
 from pipeline.simulation.textures import sample
+from pipeline.simulation.weather import dusk, head_light, lamp_light, sky
 
-_HAZE_M = 700.0
-"""m; contrast falls to 37 % over this distance on a clear day."""
-_SUN_COLOUR = np.array([[0.84], [0.96], [1.05]], dtype=np.float32)
 _SKY_COLOUR = np.array([[1.12], [1.0], [0.92]], dtype=np.float32)
-_PAINT_ALBEDO = 0.62
+_PAINT_TINT = np.array([[0.2], [0.72], [0.95]], dtype=np.float32)
+"""Of yellow paint, relative to white."""
+_AIR_M = 60.0
+"""m; height of the haze over the ground."""
+_SNOW = np.array([[0.86], [0.84], [0.82]], dtype=np.float32)
+_GONE, _LEFT = 0.15, 0.35
+"""Share of paint that is left below which it is road, and above which it is a mark; between them, who knows."""
 _BODY_M = 1.2
 """m; half length from which a part of a vehicle keeps the sky from the ground."""
 _CONTACT_M = 0.22
 """m; how far beside a vehicle the ground is darker: about its clearance."""
-_GRASS = np.array([[0.035], [0.12], [0.075]], dtype=np.float32)
 _PAVING = np.array([[0.24], [0.26], [0.27]], dtype=np.float32)
 
 
@@ -38,6 +44,7 @@ class View:
         hits: What they met.
         shadows: Of what stands still.
         focal: px.
+        R_world_cam: float64 (3,3), how the camera is turned.
     """
 
     scene: Scene
@@ -46,6 +53,7 @@ class View:
     hits: Hits
     shadows: ShadowMap
     focal: float
+    R_world_cam: Floats
 
 
 def shade(view: View) -> tuple[F32, NDArray[np.uint8]]:
@@ -54,8 +62,8 @@ def shade(view: View) -> tuple[F32, NDArray[np.uint8]]:
     colour = np.empty((3, shape[0] * shape[1]), dtype=np.float32)
     classes = np.full(shape[0] * shape[1], labels.SKY, dtype=np.uint8)
     what = view.hits.what.ravel()
-    sky = np.flatnonzero(what == SKY)
-    colour[:, sky] = _sky(view, sky)
+    above = np.flatnonzero(what == SKY)
+    colour[:, above] = _sky(view, above)
     ground = np.flatnonzero(what < SKY)
     colour[:, ground], classes[ground] = _ground(view, ground)
     points = solid_points(view.solids, view.rays, view.hits)
@@ -65,13 +73,19 @@ def shade(view: View) -> tuple[F32, NDArray[np.uint8]]:
 
 
 def _horizon(view: View) -> F32:
-    grey = np.array([[0.80], [0.78], [0.76]], dtype=np.float32)
-    return grey * np.float32(0.9 + 0.3 * view.scene.light.overcast)
+    glow = np.array(view.scene.weather.glow, dtype=np.float32)[:, None]
+    return glow * np.float32(0.9 + 0.3 * view.scene.light.overcast) * dusk(view.scene.weather)
 
 
 def _sky(view: View, pixels: NDArray[np.int64]) -> F32:
     """Blue that pales towards the horizon, with clouds on a far plane."""
     d = np.stack([view.rays.direction[k].ravel()[pixels] for k in range(3)])
+    if view.scene.weather.painted_sky:
+        shown = sky(view.scene.weather, view.scene.textures, d, view.scene.light.overcast)
+        # Fog hides the sky too, most of it near the horizon.
+        way = _AIR_M / (np.maximum(d[2], 0.0) / np.sqrt((d * d).sum(axis=0)) + np.float32(0.05))
+        clear = np.exp(-way / np.float32(view.scene.weather.sight))
+        return np.asarray(clear * shown + (1.0 - clear) * 0.6 * _horizon(view), dtype=np.float32)
     rise = np.maximum(d[2] / np.sqrt((d * d).sum(axis=0)), np.float32(0.01))
     pale = np.exp(-4.0 * rise)
     zenith = np.array([[0.75], [0.42], [0.22]], dtype=np.float32)
@@ -91,7 +105,7 @@ def _detail(view: View, pixels: NDArray[np.int64], cell: float) -> F32:
 
 
 def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint8]]:
-    scene, noise = view.scene, view.scene.textures
+    scene, noise, roadway = view.scene, view.scene.textures, view.scene.roadway
     what = view.hits.what.ravel()[pixels]
     place = places(view.rays, view.hits, pixels)
     x, y = place[0], place[1]
@@ -103,27 +117,83 @@ def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint
     repaired = sample(noise.rough, s, d, 0.35) > 1.35
     asphalt = scene.asphalt * mottle * np.where(repaired, np.float32(0.72), np.float32(1.0))
     albedo = np.repeat(asphalt[None, :], 3, axis=0)
+    roadway.mark(albedo, s, d, _detail(view, pixels, 0.025), noise)
     classes = np.full(pixels.size, labels.ROAD, dtype=np.uint8)
     raised, kerb = what == RAISED, what == KERB
     verge = raised & (np.abs(d) - np.float32(scene.surface.kerb_left) > scene.surface.pavement)
     slabs = raised & ~verge
     joints = ((np.mod(s, 0.6) < 0.02) | (np.mod(d, 0.6) < 0.02)) & (_detail(view, pixels, 0.02) > 0.4)
-    albedo[:, slabs] = _PAVING * (mottle * np.where(joints, np.float32(0.6), np.float32(1.0)))[slabs]
-    albedo[:, verge] = _GRASS * np.exp(0.35 * fine + 0.3 * middle + 0.25 * soft)[verge]
-    albedo[:, kerb] = np.float32(0.33) * mottle[kerb]
+    paving = _PAVING * np.float32(roadway.paving)
+    albedo[:, slabs] = paving * (mottle * np.where(joints, np.float32(0.6), np.float32(1.0)))[slabs]
+    grass = np.array(roadway.verge, dtype=np.float32)[:, None]
+    albedo[:, verge] = grass * np.exp(0.35 * fine + 0.3 * middle + 0.25 * soft)[verge]
+    albedo[:, kerb] = np.float32(roadway.kerb) * mottle[kerb]
     classes[raised | kerb] = labels.OTHER
-    classes[verge] = labels.VEGETATION
-    painted = ~(raised | kerb) & scene.paint.covers(s, d)
-    worn = scene.wear * (1.0 + 0.7 * fine + 0.9 * middle + 0.5 * soft)[painted]
-    fresh = np.clip(1.0 - worn, 0.25, 1.0)
-    albedo[:, painted] = fresh * np.float32(_PAINT_ALBEDO) + (1.0 - fresh) * albedo[:, painted]
-    classes[painted] = labels.LANE
+    if roadway.grassy:
+        classes[verge] = labels.VEGETATION
+    on_road = ~(raised | kerb)
+    paint = np.where(on_road, scene.paint.colours(s, d), np.uint8(0))
+    _paint(view, (s, d), paint, (fine, middle, soft), (albedo, classes))
+    if roadway.snow > 0.0:
+        _snow(view, (s, d), on_road, middle, (albedo, classes))
     lit = view.shadows.lit(place)
     lit *= ~shaded_by_movers(place, view.solids, len(scene.standing), scene.light, noise.grain)
     facing = np.full(pixels.size, scene.light.sun[2], dtype=np.float32)
     facing[kerb] *= np.float32(0.6)
     light = _light(view, facing, lit, _open_sky(view, place))
+    if scene.weather.night > 0.0:
+        up = np.array([[0.0], [0.0], [1.0]], dtype=np.float32)
+        light += _lamps(view, pixels, place, up)
+    # Water fills the pores: what is wet is darker.
+    light[:, on_road] *= np.float32(1.0 - 0.45 * scene.weather.wet)
     return _hazed(view, pixels, albedo * light), classes
+
+
+def _paint(
+    view: View,
+    place: tuple[F32, F32],
+    paint: NDArray[np.uint8],
+    grain: tuple[F32, F32, F32],
+    drawn: tuple[F32, NDArray[np.uint8]],
+) -> None:
+    """Puts paint on the ground: road coordinates, colours of the paint, grain; albedo and classes in place."""
+    albedo, classes = drawn
+    painted = np.flatnonzero(paint)
+    roadway = view.scene.roadway
+    fine, middle, soft = (g[painted] for g in grain)
+    worn = view.scene.wear * (1.0 + 0.7 * fine + 0.9 * middle + 0.5 * soft)
+    left = roadway.worn(place[0][painted], place[1][painted], view.scene.textures)
+    fresh = np.clip(1.0 - worn, 0.25, 1.0) * left
+    tint = np.where(paint[painted] == YELLOW, _PAINT_TINT, np.float32(1.0))
+    albedo[:, painted] = fresh * np.float32(roadway.paint_albedo) * tint + (1.0 - fresh) * albedo[:, painted]
+    classes[painted] = np.where(left >= _LEFT, labels.LANE, np.where(left > _GONE, labels.IGNORE, labels.ROAD))
+
+
+def _snow(
+    view: View,
+    place: tuple[F32, F32],
+    on_road: NDArray[np.bool_],
+    grain: F32,
+    drawn: tuple[F32, NDArray[np.uint8]],
+) -> None:
+    """Covers verges, pavements and what the wheels left; paint below it is road."""
+    albedo, classes = drawn
+    edge = view.scene.surface.kerb_left
+    covered = ~on_road | view.scene.roadway.snowed(place[1], place[0], view.scene.textures, edge=edge)
+    if view.scene.roadway.snow < 0.35:
+        covered &= on_road | (np.abs(grain) < 1.0)
+    albedo[:, covered] = _SNOW * (1.0 + 0.08 * grain[covered])
+    classes[covered & on_road] = labels.ROAD
+    classes[covered & ~on_road] = labels.OTHER
+
+
+def _lamps(view: View, pixels: NDArray[np.int64], place: F32, normal: F32) -> F32:
+    """Irradiance (3,N) of street lamps and of the own head lights."""
+    d = np.stack([view.rays.direction[k].ravel()[pixels] for k in range(3)])
+    seen = view.R_world_cam.T.astype(np.float32) @ d
+    facing = -(d * normal).sum(axis=0) / np.sqrt((d * d).sum(axis=0))
+    own = head_light(view.scene.weather, seen, view.hits.t.ravel()[pixels], facing)
+    return np.asarray(own + lamp_light(view.scene.weather, place, normal), dtype=np.float32)
 
 
 def _open_sky(view: View, place: F32) -> F32:
@@ -147,12 +217,12 @@ def _light(view: View, facing: F32, lit: F32, open_sky: F32) -> F32:
     light = view.scene.light
     direct = np.float32(light.direct) * np.maximum(facing, np.float32(0.0)) * lit
     return np.asarray(
-        direct * _SUN_COLOUR + np.float32(light.ambient) * open_sky * _SKY_COLOUR, dtype=np.float32
+        direct * np.array(view.scene.weather.sun, dtype=np.float32)[:, None] + np.float32(light.ambient) * open_sky * _SKY_COLOUR, dtype=np.float32
     )
 
 
 def _hazed(view: View, pixels: NDArray[np.int64], radiance: F32) -> F32:
-    clear = np.exp(-view.hits.t.ravel()[pixels] / np.float32(_HAZE_M))
+    clear = np.exp(-view.hits.t.ravel()[pixels] / np.float32(view.scene.weather.sight))
     return np.asarray(clear * radiance + (1.0 - clear) * 0.6 * _horizon(view), dtype=np.float32)
 
 
@@ -170,11 +240,21 @@ def _solids(view: View, points: SolidPoints) -> F32:
     _facade(view, points, local, albedo, np.flatnonzero(material == Material.FACADE))
     _cabin(points, albedo, np.flatnonzero(material == Material.CABIN))
     _plate(points, albedo, np.flatnonzero(material == Material.PLATE))
+    half = np.ascontiguousarray(view.solids.half.astype(np.float32)[points.solid].T)
+    resolved = np.float32(view.focal) / view.hits.t.ravel()[points.pixels]
+    surfaces = Surfaces(points, local, half, material, resolved, noise, lots_of(noise, len(view.solids)))
+    paint_materials(surfaces, albedo)
     facing = np.einsum("i,in->n", scene.light.sun.astype(np.float32), points.normal)
+    leaves |= material == Material.CANOPY
     facing = np.where(leaves, 0.35 + 0.65 * facing, facing)
     lit = view.shadows.lit(points.place + np.float32(0.25) * points.normal)
     open_sky = 0.6 + 0.4 * points.normal[2]
-    return _hazed(view, points.pixels, albedo * _light(view, facing, lit, open_sky.astype(np.float32)))
+    light = _light(view, facing, lit, open_sky.astype(np.float32))
+    if scene.weather.night > 0.0:
+        light += _lamps(view, points.pixels, points.place, points.normal)
+        # Signs and plates send head light back where it came from.
+        light *= np.where(view.solids.reflectance[points.solid] > 0.8, np.float32(3.0), np.float32(1.0))
+    return _hazed(view, points.pixels, albedo * (light + glows(surfaces, scene.weather.night)))
 
 
 def _facade(view: View, points: SolidPoints, local: F32, albedo: F32, chosen: NDArray[np.int64]) -> None:

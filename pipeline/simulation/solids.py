@@ -27,9 +27,19 @@ class Material(IntEnum):
     LEAVES = 2
     CABIN = 3
     PLATE = 4
+    FRONT = 5
+    CANOPY = 6
+    RAILING = 7
+    BARK = 8
+    RUST = 9
+    BANDS = 10
+    WOOD = 11
+    LAMP = 12
+    POSTER = 13
 
 
 _BOX, _CYLINDER, _ELLIPSOID, _LEAVES = (int(k) for k in (*Shape, Material.LEAVES))
+_CANOPY, _RAILING = int(Material.CANOPY), int(Material.RAILING)
 """Plain numbers: enumerations are slow to compare and every solid of every pass asks."""
 
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -37,6 +47,8 @@ CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 
 _RAGGED = 0.55
 """Half chord of the unit ball below which rays may pass between leaves."""
+_LOOSE = 1.15
+"""The same for a canopy, whose outline is torn and through which the sky is seen here and there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,6 +174,10 @@ class Solids:
             met = (enter < leave) & (enter > 0)
             if material == _LEAVES and shape == _ELLIPSOID:
                 met &= self._leafy(index, start, u, (enter, leave), grain)
+            elif material == _CANOPY and shape == _ELLIPSOID:
+                met &= self._loose(index, start, u, (enter, leave), grain)
+            elif material == _RAILING:
+                met &= self._barred(index, start, u, enter, grain)
         return np.where(met, enter, np.float32(np.inf))
 
     def _start(self, index: int, rays: Rays, window: tuple[slice, slice]) -> tuple[F32, F32, F32]:
@@ -193,6 +209,48 @@ class Solids:
         column = ((place[2] + 0.3 * place[1]) * np.float32(scale[2])).astype(np.int32)
         sure[rim] = half[rim] > _RAGGED * grain[row & k, column & k]
         return np.asarray(sure)
+
+    def _loose(
+        self, index: int, start: tuple[F32, F32, F32], u: F32, chord: tuple[F32, F32], grain: F32
+    ) -> NDArray[np.bool_]:
+        """Whether a ray meets a leaf of a canopy: leaves in twigs in boughs, three scales of grain."""
+        enter, leave = chord
+        half = 0.5 * (leave - enter) * np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+        met = np.zeros(half.shape, dtype=np.bool_)
+        inside = np.nonzero(half > 0)
+        t = enter[inside]
+        x, y, z = (
+            (np.broadcast_to(start[i], half.shape)[inside] + t * u[i][inside])
+            * np.float32(self.half[index, i])
+            for i in range(3)
+        )
+        k = len(grain) - 1
+        density = np.zeros(t.shape, dtype=np.float32)
+        for cells, share in ((1.9, 0.35), (6.0, 0.35), (21.0, 0.3)):
+            row = ((x + y) * np.float32(cells)).astype(np.int32) + 61 * index
+            column = ((z + 0.4 * (x - y)) * np.float32(cells)).astype(np.int32) + 17 * index
+            density += np.float32(share) * grain[row & k, column & k]
+        met[inside] = half[inside] > _LOOSE * density**2 / 0.55
+        return met
+
+    def _barred(
+        self, index: int, start: tuple[F32, F32, F32], u: F32, enter: F32, grain: F32
+    ) -> NDArray[np.bool_]:
+        """Whether a ray that enters a railing meets a bar: uprights between two rails, a lattice or planks."""
+        along, up = (
+            (start[i] + enter * u[i] + 1) * np.float32(self.half[index, i]) for i in (0, 2)
+        )
+        k = len(grain) - 1
+        kind, pitch, bar = (float(grain[(37 * index) & k, (61 * j) & k]) for j in range(3))
+        rails = (np.abs(up - 0.15) < 0.03) | (2 * np.float32(self.half[index, 2]) - up < 0.06)
+        if kind < 0.3:
+            pitch, bar = 0.10 + 0.05 * pitch, 0.84
+        elif kind < 0.55:
+            cells = (np.mod(along + up, 0.12) < 0.014) | (np.mod(along - up, 0.12) < 0.014)
+            return np.asarray(cells | rails | (np.mod(along, 2.5) < 0.06))
+        else:
+            pitch, bar = 0.09 + 0.16 * pitch, 0.12 + 0.25 * bar
+        return np.asarray((np.mod(along, pitch) < bar * pitch) | rails)
 
 
 def _cut(values: F32, full: tuple[int, ...], window: tuple[slice, slice]) -> F32:

@@ -53,3 +53,14 @@ def sample(table: F32, u: F32, v: F32, cells_per_unit: float) -> F32:
     i = np.floor(u * k).astype(np.int32) & (SIZE - 1)
     j = np.floor(v * k).astype(np.int32) & (SIZE - 1)
     return np.asarray(table[i, j], dtype=np.float32)
+
+
+def smooth(table: F32, u: F32, v: F32, cells_per_unit: float) -> F32:
+    """Values of a table at coordinates (N,), even between the cells."""
+    x, y = u * np.float32(cells_per_unit), v * np.float32(cells_per_unit)
+    i, j = np.floor(x).astype(np.int32), np.floor(y).astype(np.int32)
+    a, b = x - i, y - j
+    last = SIZE - 1
+    low = table[i & last, j & last] * (1 - b) + table[i & last, (j + 1) & last] * b
+    high = table[(i + 1) & last, j & last] * (1 - b) + table[(i + 1) & last, (j + 1) & last] * b
+    return np.asarray(low * (1 - a) + high * a, dtype=np.float32)

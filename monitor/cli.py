@@ -20,6 +20,7 @@ COMMANDS = {
     "demo": "Simulate a drive in which the camera mount slips, and watch it being told.",
     "extrinsic": "Read extrinsics of other formats into a rig file.",
     "inspect": "What a recording holds, which pairs could be watched, and what is missing.",
+    "masks": "Find lane paint and poles in image files, as the watch sees them.",
     "replay": "Judge a recording: verdict, report, rerun recording.",
     "run": "Watch live sensors on a zenoh bus.",
 }

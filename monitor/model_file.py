@@ -3,7 +3,10 @@
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.errors import ModelError
+from pipeline.segmentation import STRIDE, Segmenter
 
 DEFAULT_NAME = "bisenetv2.onnx"
 """Package data of ``models``; nothing is imported from there."""
@@ -33,3 +36,24 @@ def model_bytes(path: Path | None) -> bytes:
         raise ModelError(
             f"model {path} can not be read: {error.strerror}", hint="--model wants a .onnx file"
         ) from error
+
+
+def open_segmenter(path: Path | None, threads: int) -> Segmenter:
+    """A session of the network at ``path``, or of the one that ships.
+
+    Args:
+        path: The .onnx file, or None.
+        threads: Threads that one call may use.
+
+    Raises:
+        ModelError: It can not be read, or is none that this version can use; the text names the file.
+    """
+    try:
+        segmenter = Segmenter(model_bytes(path), threads=threads)
+        # Another grid shows with the first answer only.
+        segmenter.probabilities(np.zeros((STRIDE, STRIDE, 3), dtype=np.uint8))
+    except ModelError as error:
+        if path is None or str(path) in error.what:
+            raise
+        raise ModelError(f"model {path}: {error.what}", hint=error.hint) from error
+    return segmenter

@@ -145,10 +145,10 @@ def test_training_learns_resumes_and_keeps_to_its_time(tmp_path):
     before_fall = train.start(recipe, device)
     before_fall.load(tmp_path / train.BEFORE_FALL)
     assert before_fall.step == 2
-    second = go_on(0.5)
-    assert (second.step, second.spent_s) == (30, 30.0)
+    second = go_on(0.75)
+    assert (second.step, second.spent_s) == (45, 45.0)
     before_fall.load(tmp_path / train.BEFORE_FALL)
-    assert before_fall.step == 2  # 15 of 30 s: the rate was falling already
+    assert before_fall.step == 2  # 15 of 45 s: the rate was falling already
     assert not list(tmp_path.glob("*.tmp"))
     rgb, label, _ = sampler.batch(4, np.random.default_rng(3))
     with torch.no_grad():

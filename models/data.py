@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -19,9 +19,12 @@ from models import augment, composite
 from pipeline import labels
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+_T = TypeVar("_T")
 
 THIN = (labels.LANE, labels.POLE)
 """Classes that crops are centred on."""
@@ -30,47 +33,19 @@ CACHE_BYTES = 2 << 30
 """Decoded pictures kept in memory; more are decoded again at each use."""
 
 
-def group_table(folded_into: dict[int, list[int]] | None = None) -> NDArray[np.bool_]:
-    """Return what each label value may be: bool (classes, classes), row = value, column = class.
-
-    Args:
-        folded_into: Label value -> all classes that its pixels may be; values not named mean themselves.
-
-    Raises:
-        ValueError: If a value or class is not in the label contract, or a group leaves out its own value.
-    """
-    table = np.eye(len(labels.NAMES), dtype=np.bool_)
-    for value, group in (folded_into or {}).items():
-        if (
-            not 0 <= value < len(labels.NAMES)
-            or not all(0 <= c < len(labels.NAMES) for c in group)
-            or value not in group
-        ):
-            raise ValueError(f"group {value} -> {group} does not fit the {len(labels.NAMES)} classes")
-        table[value] = False
-        table[value, group] = True
-    return table
-
-
 class DataError(Exception):
     """A training folder that does not keep the layout; the text names the file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LabelledSet:
-    """One set of one camera or source.
+class LabelledSet(labels.SetDescription):
+    """One set of one camera or source, and what its ``set.json`` says.
 
     Args:
         folder: Where it lies.
-        groups: What a label value may be, bool (classes, classes), see ``group_table``.
-        labelled: The classes that were drawn.
-        splits: Split name -> picture ids.
     """
 
     folder: Path
-    groups: NDArray[np.bool_]
-    labelled: frozenset[int]
-    splits: dict[str, tuple[str, ...]]
 
     def files(self, identifier: str) -> tuple[Path, Path]:
         """Return picture and label of one id.
@@ -100,13 +75,9 @@ class LabelledSet:
             raise DataError(f"{label_file}: picture or 8 bit label of one channel can not be decoded")
         if picture.shape[:2] != label.shape:
             raise DataError(f"{label_file}: {label.shape} does not fit the picture's {picture.shape[:2]}")
-        table = np.eye(len(labels.NAMES), dtype=np.bool_)
-        known = {*self.labelled, *np.flatnonzero((self.groups != table).any(axis=1)).tolist(), labels.IGNORE}
-        strange = set(np.unique(label).tolist()) - known
+        strange = self.strange_values(label.astype(np.uint8, copy=False))
         if strange:
-            raise DataError(
-                f"{label_file}: values {sorted(strange)} are neither labelled nor folded in set.json"
-            )
+            raise DataError(f"{label_file}: values {strange} are neither labelled nor folded in set.json")
         return picture.astype(np.uint8, copy=False), label.astype(np.uint8, copy=False)
 
 
@@ -116,17 +87,16 @@ def read_set(folder: Path) -> LabelledSet:
     Raises:
         DataError: If it is missing or says something that does not fit the label contract.
     """
+    said = _read(folder / "set.json", labels.read_description)
+    return LabelledSet(groups=said.groups, labelled=said.labelled, splits=said.splits, folder=folder)
+
+
+def _read(path: Path, check: Callable[[object], _T]) -> _T:
+    """Decode a JSON file and check what it says."""
     try:
-        said: dict[str, Any] = json.loads((folder / "set.json").read_text(encoding="utf-8"))
-        folded = {int(value): [int(c) for c in group] for value, group in said.get("folded_into", {}).items()}
-        return LabelledSet(
-            folder=folder,
-            groups=group_table(folded),
-            labelled=frozenset(int(c) for c in said["labelled_classes"]),
-            splits={str(name): tuple(map(str, ids)) for name, ids in said["splits"].items()},
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{folder / 'set.json'}: {error}") from error
+        return check(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def read_sets(roots: list[Path]) -> list[LabelledSet]:
@@ -138,11 +108,8 @@ def read_sets(roots: list[Path]) -> list[LabelledSet]:
     found: list[LabelledSet] = []
     for root in roots:
         contract = root / "classes.json"
-        if (
-            contract.is_file()
-            and tuple(json.loads(contract.read_text(encoding="utf-8"))["classes"]) != labels.NAMES
-        ):
-            raise DataError(f"{contract}: classes are not {', '.join(labels.NAMES)}")
+        if contract.is_file():
+            _read(contract, labels.check_class_names)
         found += [read_set(path.parent) for path in sorted(root.glob("*/set.json"))]
     if not found:
         raise DataError(f"no */set.json below {', '.join(map(str, roots))}")

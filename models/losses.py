@@ -25,7 +25,7 @@ def grouped_nll(
     Args:
         logits: (B, classes, h, w).
         target: Label values, integer (B, f*h, f*w) with a whole number f; ``labels.IGNORE`` takes no part.
-        groups: What a value may be, bool (B, classes, classes), see ``data.group_table``.
+        groups: What a value may be, bool (B, classes, classes), see ``labels.group_table``.
         weights: Weight of a pixel by its label value, (classes,).
     """
     batch, _, height, width = logits.shape

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from models import data
-from models.data import DataError, Sampler, fingerprint, group_table, read_set, read_sets
+from models.data import DataError, Sampler, fingerprint, read_set, read_sets
 from pipeline import labels
 
 
@@ -29,19 +29,6 @@ def write_set(folder, *, pictures=3, said=None, size=(120, 200)):
     return folder
 
 
-def test_groups_read_values_as_the_index_says():
-    table = group_table({0: [0, 2], 3: [3, 1]})
-    assert table[0].nonzero()[0].tolist() == [0, 2]
-    assert table[3].nonzero()[0].tolist() == [1, 3]
-    assert np.array_equal(table[1], np.eye(len(labels.NAMES), dtype=bool)[1])
-
-
-@pytest.mark.parametrize("folded", [{0: [1, 2]}, {9: [9]}, {0: [0, 9]}, {-1: [-1]}])
-def test_groups_outside_the_contract_are_refused(folded):
-    with pytest.raises(ValueError, match="does not fit"):
-        group_table(folded)
-
-
 def test_a_set_gives_its_pictures_and_labels(tmp_path):
     one = read_set(write_set(tmp_path / "a"))
     picture, label = one.read("000")
@@ -57,6 +44,7 @@ def test_a_set_gives_its_pictures_and_labels(tmp_path):
         {"labelled_classes": None},
         {"splits": [1]},
         {"splits": {"train": 4}},
+        {"splits": {"train": ["../../a"]}},
         {"folded_into": {"0": [3]}},
         {"folded_into": {"x": [0]}},
         {"folded_into": [0]},

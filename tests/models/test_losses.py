@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from models import losses  # noqa: E402 the extra is asked for first
-from models.data import group_table  # noqa: E402
 from pipeline import labels  # noqa: E402
+from pipeline.labels import group_table  # noqa: E402
 
 CLASSES = len(labels.NAMES)
 

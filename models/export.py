@@ -42,7 +42,10 @@ class Probabilities(torch.nn.Module):
     def forward(self, rgb: torch.Tensor) -> torch.Tensor:
         """Map (1, 3, H, W) to probabilities (1, classes, H/2, W/2)."""
         logits, _ = self.network(rgb)
-        return torch.softmax(logits - self.overstated, dim=1)
+        # Spelt out: the runtime's own softmax across channels takes some five times as long.
+        weighed = logits - self.overstated
+        odds = torch.exp(weighed - weighed.amax(dim=1, keepdim=True))
+        return odds / odds.sum(dim=1, keepdim=True)
 
 
 def to_onnx(

@@ -78,30 +78,54 @@ def find_image_segments(image: CameraImage, camera: CameraModel) -> list[ImageLi
         Lines in ideal pixels, of at least ``MIN_LENGTH_PX``.
     """
     grey = np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    grey, coarser = shrunk(grey, camera)
     found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     if found is None:
         return []
-    return segments_to_lines(np.asarray(found, dtype=np.float64).reshape(-1, 2, 2), grey, camera)
+    segments = np.asarray(found, dtype=np.float64).reshape(-1, 2, 2)
+    return segments_to_lines(segments, grey, coarser, camera)
 
 
-def segments_to_lines(segments: Floats, grey: NDArray[np.uint8], camera: CameraModel) -> list[ImageLine]:
+def shrunk(grey: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], int]:
+    """The image at the resolution that is looked at, and how many of its px (to a side) one px covers.
+
+    Lenses of long focal length blur over more px; LSD's cost grows with the px and its yield does not.
+    """
+    coarser = max(1, int(_unit(camera)))
+    if coarser == 1 or min(grey.shape) < 2 * coarser:
+        return grey, 1
+    height, width = (side // coarser for side in grey.shape)
+    whole = grey[: height * coarser, : width * coarser]
+    small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8), coarser
+
+
+def _unit(camera: CameraModel) -> float:
+    return max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
+
+
+def segments_to_lines(
+    segments: Floats, grey: NDArray[np.uint8], coarser: int, camera: CameraModel
+) -> list[ImageLine]:
     """What follows LSD: sub-pixel points, undistortion, fit, merging, shortest length.
 
     Args:
-        segments: float64 (N,2,2), rough start and end of each piece, raw px.
-        grey: uint8 (H,W), the raw image.
-        camera: Its intrinsics.
+        segments: float64 (N,2,2), rough start and end of each piece, px of ``grey``.
+        grey: uint8 (H,W), the raw image as :func:`shrunk` gives it.
+        coarser: Raw px to one px of ``grey``, each way.
+        camera: Intrinsics of the raw image.
 
     Returns:
         As :func:`find_image_segments`.
     """
-    unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
+    unit = _unit(camera)
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MOST_PIECES]
-    segments = segments[order[length[order] >= MIN_PIECE_PX * unit]]
+    segments = segments[order[length[order] >= MIN_PIECE_PX * unit / coarser]]
     if len(segments) == 0:
         return []
-    points, piece, directed = _edge_points(segments, grey, unit)
+    points, piece, directed = _edge_points(segments, grey, unit / coarser)
+    points = (points + 0.5) * coarser - 0.5
     if camera.model != "pinhole":
         points = ideal_pixels(camera, points)
     sound = np.isfinite(points).all(axis=1)
@@ -112,7 +136,7 @@ def segments_to_lines(segments: Floats, grey: NDArray[np.uint8], camera: CameraM
 def _edge_points(
     segments: Floats, grey: NDArray[np.uint8], unit: float
 ) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Edge points (M,2), raw px, at stations of each segment, the segment of each, and its sense (N,2).
+    """Edge points (M,2), px of ``grey``, at stations of each segment, whose they are, and its sense (N,2).
 
     The sense is the direction of a segment, turned so that grey values rise to its right as u, v are drawn.
     """

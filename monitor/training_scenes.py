@@ -58,8 +58,9 @@ def write_scenes(folder: Path, count: int, seed: int, workers: int) -> None:
             "source": "simulated streets (calibwatch)",
             "licence": "Apache-2.0",
             "labelled_classes": list(range(len(labels.NAMES))),
-            "unlabelled_notes": "all classes, exact; people and pavement are 0, tree trunks 6",
-            "cameras": "drawn: five image sizes, focal length 0.5 to 1.15 widths, some barrel distortion",
+            "unlabelled_notes": "all classes, exact; people, pavement, kerbs and wires are 0, tree trunks and "
+            "boughs 6, fences with their stakes 5; 255 on the own bonnet and on paint worn by two thirds or more",
+            "cameras": "drawn: twelve image sizes, focal length 0.45 to 2.2 widths, some with distortion",
             "splits": {
                 "train": [name for k, name in enumerate(identifiers) if k % VALIDATION_EVERY],
                 "val": identifiers[::VALIDATION_EVERY],

@@ -16,6 +16,7 @@ from pipeline.cameras import undistort
 from pipeline.errors import InputError
 from pipeline.records import CameraImage, CameraModel, Floats, read_only
 from pipeline.simulation.raycast import Hits, Window, cast
+from pipeline.simulation.reflections import add_reflections, mirror_below
 from pipeline.simulation.scene import Scene
 from pipeline.simulation.shading import View, shade
 from pipeline.simulation.shadows import ShadowMap
@@ -142,7 +143,8 @@ def render(
     windows = _windows(solids, optics, T_world_cam)
     rays = _rays(optics.rays[0], T_world_cam)
     hits = cast(scene, solids, rays, windows)
-    radiance, classes = shade(View(scene, solids, rays, hits, shadows, focal, R))
+    first = View(scene, solids, rays, hits, shadows, focal, R)
+    radiance, classes = shade(first)
     column, row = np.nonzero(_busy(radiance, classes, hits).T)
     xy = optics.rays[1:, :, row, column].transpose(1, 2, 0).reshape(2, 1, -1)
     more = _rays(xy, T_world_cam)
@@ -153,6 +155,9 @@ def render(
     radiance[:, row, column] = total / np.float32(len(GRID))
     votes = np.concatenate([classes[row, column][:, None], more_classes.reshape(-1, per_pixel)], axis=1)
     classes[row, column] = _voted(votes)
+    if scene.weather.wet > 0.0:
+        mirror = mirror_below(scene, T_world_cam)
+        add_reflections(first, mirror, _windows(solids, optics, mirror.T_world_cam), radiance, classes)
     return Picture(CameraImage(_developed(radiance, look, rng)), classes)
 
 
@@ -226,7 +231,7 @@ def _voted(votes: NDArray[np.uint8]) -> NDArray[np.uint8]:
     candidates = np.array([*range(len(labels.NAMES)), labels.IGNORE], dtype=np.uint8)
     score = np.stack([16 * (votes == k).sum(axis=1) + r for k, r in zip(candidates, _RANK, strict=True)])
     # A class without a vote must not win by its rank.
-    return candidates[np.argmax(np.where(score >= 16, score, -1), axis=0)]
+    return np.asarray(candidates[np.argmax(np.where(score >= 16, score, -1), axis=0)], dtype=np.uint8)
 
 
 def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -249,7 +254,9 @@ def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[n
 def _scattered(light: F32, gain: np.float32, look: Look) -> F32:
     """Light (H,W,3) with halos about what is too bright, and a veil."""
     height, width = light.shape[:2]
-    small = cv2.resize(np.minimum(light, 12.0 / gain), (width // 4, height // 4), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        np.minimum(light, 12.0 / gain), (width // 4, height // 4), interpolation=cv2.INTER_AREA
+    )
     halo = cv2.GaussianBlur(small, (0, 0), 0.004 * width) + cv2.GaussianBlur(small, (0, 0), 0.02 * width)
     wide = cv2.resize(halo, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(light + 0.5 * look.bloom * wide + look.veil / gain, dtype=np.float32)

@@ -150,9 +150,7 @@ def house(
     return parts
 
 
-def arcade(
-    ground: Floats, heading: float, length: float, rng: np.random.Generator
-) -> list[Solid]:
+def arcade(ground: Floats, heading: float, length: float, rng: np.random.Generator) -> list[Solid]:
     """Pillars, square or round, under a beam: what holds up a porch, a bridge or a station roof."""
     pitch, height = float(rng.uniform(1.8, 5.0)), float(rng.uniform(2.6, 5.0))
     radius, colour = float(rng.uniform(0.12, 0.4)), pick(rng, _WALLS, 0.3)
@@ -170,12 +168,12 @@ def arcade(
     return [*parts, Solid(Shape.BOX, over, axes, beam, labels.CONSTRUCTION, colour, 0.35)]
 
 
-def fence(
-    ground: Floats, heading: float, length: float, rng: np.random.Generator
-) -> list[Solid]:
+def fence(ground: Floats, heading: float, length: float, rng: np.random.Generator) -> list[Solid]:
     """A railing, a picket fence or wire mesh between posts that belong to the fence."""
     height = float(rng.uniform(0.8, 2.2))
-    colour = pick(rng, ((0.03, 0.03, 0.03), (0.35, 0.35, 0.35), (0.6, 0.6, 0.6), (0.1, 0.17, 0.25), (0.05, 0.12, 0.05)))
+    colour = pick(
+        rng, ((0.03, 0.03, 0.03), (0.35, 0.35, 0.35), (0.6, 0.6, 0.6), (0.1, 0.17, 0.25), (0.05, 0.12, 0.05))
+    )
     axes = upright(heading)
     wall = 0.4 if rng.random() < 0.25 else 0.0
     sheet = Solid(
@@ -192,14 +190,14 @@ def fence(
     if wall:
         parts.append(panel(ground, heading, (length, 0.3, wall), pick(rng, _WALLS), labels.CONSTRUCTION))
     for x in np.arange(-length / 2, length / 2 + 0.01, float(rng.uniform(2.0, 3.5))):
-        stake = post(ground + x * axes[:, 0], wall + height + 0.1, float(rng.uniform(0.02, 0.06)), (0.0, 0.0), colour)
+        stake = post(
+            ground + x * axes[:, 0], wall + height + 0.1, float(rng.uniform(0.02, 0.06)), (0.0, 0.0), colour
+        )
         parts.append(replace(stake, label=labels.CONSTRUCTION))
     return parts
 
 
-def guard_rail(
-    ground: Floats, heading: float, length: float, rng: np.random.Generator
-) -> list[Solid]:
+def guard_rail(ground: Floats, heading: float, length: float, rng: np.random.Generator) -> list[Solid]:
     """A steel beam or two cables on short posts, or a concrete barrier: one stretch of it."""
     steel = pick(rng, ((0.4, 0.4, 0.4), (0.25, 0.28, 0.3)), 0.2)
     axes = upright(heading)
@@ -222,7 +220,9 @@ def billboard(ground: Floats, heading: float, rng: np.random.Generator) -> list[
     if not clear:
         return [sheet]
     legs = [
-        replace(post(ground + k * 0.7 * width * axes[:, 1], clear, 0.09, (0.0, 0.0)), label=labels.CONSTRUCTION)
+        replace(
+            post(ground + k * 0.7 * width * axes[:, 1], clear, 0.09, (0.0, 0.0)), label=labels.CONSTRUCTION
+        )
         for k in (-1.0, 1.0)
     ]
     return [sheet, *legs]

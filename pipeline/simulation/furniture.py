@@ -318,8 +318,11 @@ def _lamps_and_plate(length: float, width: float, height: float) -> list[Solid]:
     red, white = (0.03, 0.03, 0.4), (0.6, 0.6, 0.6)
     half = (0.03, 0.14, 0.08)
     return [
-        *(_part((-length / 2, y * 0.4 * width, height), half, red, 0.9) for y in (-1.0, 1.0)),
-        *(_part((length / 2, y * 0.38 * width, 0.9 * height), half, white, 0.6) for y in (-1.0, 1.0)),
+        *(_part((-length / 2, y * 0.4 * width, height), half, red, 0.9, Material.LIGHT) for y in (-1.0, 1.0)),
+        *(
+            _part((length / 2, y * 0.38 * width, 0.9 * height), half, white, 0.6, Material.LIGHT)
+            for y in (-1.0, 1.0)
+        ),
         _part((-length / 2, 0.0, 0.8 * height), (0.02, 0.26, 0.06), white, 0.95),
     ]
 

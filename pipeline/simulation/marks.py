@@ -10,7 +10,14 @@ from pipeline.simulation.paint import WHITE, YELLOW, Line, Paint, Patch, Stroke
 from pipeline.simulation.scene import SceneParameters
 
 _GLYPHS = {
-    "B": ((0, 0, 0, 7), (0, 7, 2.6, 6), (2.6, 6, 2.6, 4.4), (2.6, 4.4, 0, 3.6), (2.6, 3, 2.6, 1), (2.6, 1, 0, 0)),
+    "B": (
+        (0, 0, 0, 7),
+        (0, 7, 2.6, 6),
+        (2.6, 6, 2.6, 4.4),
+        (2.6, 4.4, 0, 3.6),
+        (2.6, 3, 2.6, 1),
+        (2.6, 1, 0, 0),
+    ),
     "U": ((0, 7, 0, 0.4), (0, 0.3, 3, 0.3), (3, 0.4, 3, 7)),
     "S": ((3, 6.6, 0, 6.6), (0, 6.6, 0, 3.6), (0, 3.6, 3, 3.6), (3, 3.6, 3, 0.4), (3, 0.4, 0, 0.4)),
     "T": ((0, 6.7, 3, 6.7), (1.5, 6.7, 1.5, 0)),
@@ -80,9 +87,7 @@ def _middle(d: float, p: SceneParameters, phase: float, colour: int, rng: np.ran
     return [Line(d - 0.5 * w - 0.09, w, *dash, phase, colour), second]
 
 
-def _junction(
-    p: SceneParameters, s: float, rng: np.random.Generator
-) -> tuple[list[Patch], list[Stroke]]:
+def _junction(p: SceneParameters, s: float, rng: np.random.Generator) -> tuple[list[Patch], list[Stroke]]:
     """A stop line, dashed or whole, a crossing of bars, of two lines or none, arrows in the lanes before it."""
     edge, forward = p.lanes * p.lane_width / 2, (p.lanes + 1) // 2
     patches: list[Patch] = []
@@ -91,7 +96,8 @@ def _junction(
     if kind < 0.5:
         bar, long = float(rng.uniform(0.3, 0.6)), float(rng.uniform(2.2, 4.5))
         patches += [
-            Patch((s, s + long), float(d), (bar / 2, bar / 2)) for d in np.arange(-edge + bar, edge, 2.0 * bar)
+            Patch((s, s + long), float(d), (bar / 2, bar / 2))
+            for d in np.arange(-edge + bar, edge, 2.0 * bar)
         ]
     elif kind < 0.75:
         wide = float(rng.uniform(0.12, 0.4))
@@ -111,9 +117,7 @@ def _junction(
     return patches, strokes
 
 
-def _arrow(
-    s: float, d: float, way: float, rng: np.random.Generator
-) -> tuple[list[Patch], list[Stroke]]:
+def _arrow(s: float, d: float, way: float, rng: np.random.Generator) -> tuple[list[Patch], list[Stroke]]:
     """An arrow of 3 to 6 m ahead, to a side or both; ``way`` is +1 along the road, -1 against it."""
     long, shaft = float(rng.uniform(3.0, 6.0)), float(rng.uniform(0.1, 0.2))
     side = float(rng.choice([-1.0, 1.0]))
@@ -137,9 +141,7 @@ def _arrow(
     return patches, strokes
 
 
-def _in_lane(
-    p: SceneParameters, s: float, rng: np.random.Generator
-) -> tuple[list[Patch], list[Stroke]]:
+def _in_lane(p: SceneParameters, s: float, rng: np.random.Generator) -> tuple[list[Patch], list[Stroke]]:
     """Words, arrows, hatched areas, lines that part or join, a give-way line."""
     edge, forward = p.lanes * p.lane_width / 2, (p.lanes + 1) // 2
     lane = int(rng.integers(p.lanes))
@@ -157,7 +159,11 @@ def _in_lane(
         # The border of a lane that begins or ends: it leaves one line and joins the next.
         long = float(rng.uniform(12.0, 40.0))
         first = -edge + int(rng.integers(p.lanes + 1)) * p.lane_width
-        return [], [Stroke((s, first), (s + long, first + float(rng.choice([-1.0, 1.0])) * p.lane_width), p.paint_width)]
+        return [], [
+            Stroke(
+                (s, first), (s + long, first + float(rng.choice([-1.0, 1.0])) * p.lane_width), p.paint_width
+            )
+        ]
     if kind < 0.85:
         teeth = np.arange(d - 0.5 * p.lane_width + 0.3, d + 0.5 * p.lane_width - 0.2, 0.6)
         return [Patch((s, s + 0.6), float(x), (0.2, 0.0)) for x in teeth], []
@@ -222,7 +228,9 @@ def draw_flaws(p: SceneParameters, kerb: float, snow: float, rng: np.random.Gene
         gain = float(rng.choice([0.35, 0.55, 1.5, 2.2], p=[0.4, 0.3, 0.2, 0.1]))
         first = float(rng.uniform(-20.0, 60.0))
         ribbons.append(
-            Ribbon(d, float(rng.uniform(0.02, 0.13)), gain, float(rng.uniform(0.0, 0.2)), (first, first + 90.0))
+            Ribbon(
+                d, float(rng.uniform(0.02, 0.13)), gain, float(rng.uniform(0.0, 0.2)), (first, first + 90.0)
+            )
         )
     for _ in range(int(rng.poisson(1.5))):
         ribbons.append(
@@ -290,4 +298,3 @@ def _blots(p: SceneParameters, wide: float, rng: np.random.Generator) -> list[Bl
         place = (float(rng.uniform(2.0, 30.0)), float(rng.uniform(-wide, wide)))
         blots.append(Blot(place, (2.0 * size, size), 0.55, sealed=False, round=True))
     return blots
-

@@ -65,6 +65,8 @@ def glows(s: Surfaces, night: float) -> F32:
     light = np.zeros(s.material.shape, dtype=np.float32)
     lamps = s.of(Material.LAMP)
     light[lamps] = np.float32(0.3 + 14.0 * night)
+    # Lights of vehicles: like any surface by day.
+    light[s.of(Material.LIGHT)] = np.float32(9.0 * night)
     front = s.of(Material.FRONT)
     if night > 0.0 and front.size:
         cells = _cells(s, front)
@@ -141,7 +143,9 @@ def _poster(s: Surfaces, albedo: F32) -> None:
     line = (np.mod(up, 0.34) < 0.14) & (np.mod(row + column, 2.0) < 1.0)
     letter = sample(s.textures.fine, np.floor(across * 9.0), np.floor(up / 0.34), 1.0) > -0.2
     albedo[:, k[line & letter]] = np.float32(0.7)
-    edge = (s.half[2, k] - np.abs(up) < 0.08) | (np.where(thin == 1, s.half[0, k], s.half[1, k]) - np.abs(across) < 0.08)
+    edge = (s.half[2, k] - np.abs(up) < 0.08) | (
+        np.where(thin == 1, s.half[0, k], s.half[1, k]) - np.abs(across) < 0.08
+    )
     albedo[:, k[edge]] = np.float32(0.3)
 
 
@@ -191,16 +195,15 @@ def _cells(s: Surfaces, k: NDArray[np.int64]) -> _Cells:
     tall = np.where(ground, 3.0 + 1.2 * lot[:, 9], storey)
     glass = window & (in_a < width - rim / size) & (in_b < height - rim / tall)
     bars = (0.5 + 1.5 * np.floor(3.0 * lot[:, 7])) / np.maximum(width * size, 0.2)
-    mullion = np.mod((np.mod(a, 1.0) - 0.5) * size * bars + 0.5 * np.floor(2.0 * lot[:, 11]), 1.0) < 0.05 * bars
+    mullion = (
+        np.mod((np.mod(a, 1.0) - 0.5) * size * bars + 0.5 * np.floor(2.0 * lot[:, 11]), 1.0) < 0.05 * bars
+    )
     transom = np.abs((np.mod(b, 1.0) - 0.6) * tall) < np.where(lot[:, 12] < 0.5, 0.025, 0.0)
     glass &= ~(mullion | transom)
-    return _Cells(
-        *(np.asarray(x, dtype=np.float32) for x in (along, up, a, b, size, tall, lot, hue)),
-        window,
-        glass,
-        ground & wall,
-        shop,
+    along, up, a, b, size, tall, hue = (
+        np.asarray(x, dtype=np.float32) for x in (along, up, a, b, size, tall, hue)
     )
+    return _Cells(along, up, a, b, size, tall, lot, hue, window, glass, ground & wall, shop)
 
 
 def _front(s: Surfaces, albedo: F32) -> None:

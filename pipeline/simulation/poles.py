@@ -70,7 +70,9 @@ def street_lamp(
     mast = _finished(post(ground, height, radius, lean, colour), material)
     parts = [mast]
     if rng.random() < 0.4:
-        parts.append(_finished(post(ground, float(rng.uniform(0.6, 1.6)), 1.5 * radius, lean, colour), material))
+        parts.append(
+            _finished(post(ground, float(rng.uniform(0.6, 1.6)), 1.5 * radius, lean, colour), material)
+        )
     top, kind = _top(mast), int(rng.integers(5))
     inward = -side * _aside(heading)
     if kind == 0:
@@ -103,9 +105,7 @@ def _bent(top: Floats, way: Floats, size: tuple[float, float], radius: float, co
     ]
 
 
-def plate(
-    place: Floats, facing: float, half: tuple[float, float], rng: np.random.Generator
-) -> Solid:
+def plate(place: Floats, facing: float, half: tuple[float, float], rng: np.random.Generator) -> Solid:
     """A sign that faces against ``facing``: round, square, on its tip or oblong, ``half`` wide and high."""
     axes, kind = upright(facing), rng.random()
     size = np.array([0.015, half[0], half[1]])
@@ -147,16 +147,16 @@ def board(ground: Floats, heading: float, rng: np.random.Generator) -> list[Soli
     colour, material = _steel(rng)
     way, back = _aside(heading), 0.1 * np.array([math.cos(heading), math.sin(heading), 0.0])
     parts = [
-        _finished(post(ground + k * 0.6 * width * way, clear + 2.0 * height, 0.05, (0.0, 0.0), colour), material)
+        _finished(
+            post(ground + k * 0.6 * width * way, clear + 2.0 * height, 0.05, (0.0, 0.0), colour), material
+        )
         for k in (-1.0, 1.0)
     ]
     middle = ground + np.array([0.0, 0.0, clear + height]) - back
     return [*parts, plate(middle, heading, (width, height + 0.05), rng)]
 
 
-def signal(
-    ground: Floats, heading: float, side: float, lean: Lean, rng: np.random.Generator
-) -> list[Solid]:
+def signal(ground: Floats, heading: float, side: float, lean: Lean, rng: np.random.Generator) -> list[Solid]:
     """Traffic lights on a post, and half of the time on an arm over the road as well."""
     colour, material = _steel(rng)
     arm = rng.random() < 0.5
@@ -197,9 +197,7 @@ def signal_head(place: Floats, facing: float, rng: np.random.Generator) -> list[
     return [box, lamp]
 
 
-def gantry(
-    left: Floats, right: Floats, heading: float, rng: np.random.Generator
-) -> list[Solid]:
+def gantry(left: Floats, right: Floats, heading: float, rng: np.random.Generator) -> list[Solid]:
     """Two posts and a beam across the road with signs on it."""
     height, radius = float(rng.uniform(5.2, 6.5)), float(rng.uniform(0.1, 0.22))
     colour, _ = _steel(rng)
@@ -211,7 +209,9 @@ def gantry(
         if rng.random() < 0.3:
             parts += signal_head(place, heading, rng)
         else:
-            parts.append(plate(place, heading, (float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.6, 1.1))), rng))
+            parts.append(
+                plate(place, heading, (float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.6, 1.1))), rng)
+            )
     return parts
 
 
@@ -237,7 +237,15 @@ def utility_poles(grounds: list[Floats], heading: float, rng: np.random.Generato
         if rng.random() < 0.25:
             place = _top(mast) - mast.axes[:, 2] * 1.8 + 0.35 * way
             parts.append(
-                Solid(Shape.CYLINDER, place, np.eye(3), np.array([0.22, 0.22, 0.4]), labels.OTHER, (0.3, 0.3, 0.3), 0.3)
+                Solid(
+                    Shape.CYLINDER,
+                    place,
+                    np.eye(3),
+                    np.array([0.22, 0.22, 0.4]),
+                    labels.OTHER,
+                    (0.3, 0.3, 0.3),
+                    0.3,
+                )
             )
         tops.append(ends)
     for first, second in zip(tops[:-1], tops[1:], strict=True):

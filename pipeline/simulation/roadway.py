@@ -166,4 +166,3 @@ def _blot(blot: Blot, albedo: F32, s: F32, d: F32) -> None:
             rim = ~inside | (a > blot.half[0] - 0.05) | (b > blot.half[1] - 0.05)
             albedo[:, near[rim]] *= np.float32(0.4)
     albedo[:, near[inside]] *= np.float32(blot.gain)
-

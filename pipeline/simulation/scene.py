@@ -233,7 +233,9 @@ def _lean(p: SceneParameters, rng: np.random.Generator) -> tuple[float, float]:
     return float(a), float(b)
 
 
-def places_along(p: SceneParameters, spacing: float, rng: np.random.Generator, jitter: float = 0.2) -> list[float]:
+def places_along(
+    p: SceneParameters, spacing: float, rng: np.random.Generator, jitter: float = 0.2
+) -> list[float]:
     """Arc lengths of things that stand at about regular distances."""
     s = np.arange(-BEHIND_M + rng.uniform(0.0, spacing), p.length, spacing)
     return list(s + rng.uniform(-jitter, jitter, len(s)) * spacing)

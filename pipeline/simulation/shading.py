@@ -80,8 +80,9 @@ def _horizon(view: View) -> F32:
 def _sky(view: View, pixels: NDArray[np.int64]) -> F32:
     """Blue that pales towards the horizon, with clouds on a far plane."""
     d = np.stack([view.rays.direction[k].ravel()[pixels] for k in range(3)])
-    if view.scene.weather.painted_sky:
-        shown = sky(view.scene.weather, view.scene.textures, d, view.scene.light.overcast)
+    if view.scene.weather.glossy:
+        light = view.scene.light
+        shown = sky(view.scene.weather, view.scene.textures, d, light.sun, light.overcast)
         # Fog hides the sky too, most of it near the horizon.
         way = _AIR_M / (np.maximum(d[2], 0.0) / np.sqrt((d * d).sum(axis=0)) + np.float32(0.05))
         clear = np.exp(-way / np.float32(view.scene.weather.sight))
@@ -146,7 +147,22 @@ def _ground(view: View, pixels: NDArray[np.int64]) -> tuple[F32, NDArray[np.uint
         light += _lamps(view, pixels, place, up)
     # Water fills the pores: what is wet is darker.
     light[:, on_road] *= np.float32(1.0 - 0.45 * scene.weather.wet)
-    return _hazed(view, pixels, albedo * light), classes
+    radiance = albedo * light
+    if scene.weather.glossy:
+        radiance += _glare(view, pixels, lit)
+    return _hazed(view, pixels, radiance), classes
+
+
+def _glare(view: View, pixels: NDArray[np.int64], lit: F32) -> F32:
+    """Radiance (3,N) of the sun that the ground throws back at a flat angle."""
+    d = np.stack([view.rays.direction[k].ravel()[pixels] for k in range(3)])
+    d /= np.sqrt((d * d).sum(axis=0))
+    sun, weather = view.scene.light.sun.astype(np.float32), view.scene.weather
+    toward = np.maximum(d[0] * sun[0] + d[1] * sun[1] - d[2] * sun[2], np.float32(0.0))
+    flat = (1.0 - np.clip(-d[2], 0.0, 1.0)) ** 5
+    lobe = (toward ** np.float32(12.0 + 60.0 * weather.wet)) * flat * lit
+    strength = np.float32(view.scene.light.direct * (0.35 + 4.0 * weather.wet))
+    return np.asarray(strength * lobe * np.array(weather.sun, dtype=np.float32)[:, None], dtype=np.float32)
 
 
 def _paint(
@@ -166,7 +182,9 @@ def _paint(
     fresh = np.clip(1.0 - worn, 0.25, 1.0) * left
     tint = np.where(paint[painted] == YELLOW, _PAINT_TINT, np.float32(1.0))
     albedo[:, painted] = fresh * np.float32(roadway.paint_albedo) * tint + (1.0 - fresh) * albedo[:, painted]
-    classes[painted] = np.where(left >= _LEFT, labels.LANE, np.where(left > _GONE, labels.IGNORE, labels.ROAD))
+    classes[painted] = np.where(
+        left >= _LEFT, labels.LANE, np.where(left > _GONE, labels.IGNORE, labels.ROAD)
+    )
 
 
 def _snow(
@@ -217,7 +235,9 @@ def _light(view: View, facing: F32, lit: F32, open_sky: F32) -> F32:
     light = view.scene.light
     direct = np.float32(light.direct) * np.maximum(facing, np.float32(0.0)) * lit
     return np.asarray(
-        direct * np.array(view.scene.weather.sun, dtype=np.float32)[:, None] + np.float32(light.ambient) * open_sky * _SKY_COLOUR, dtype=np.float32
+        direct * np.array(view.scene.weather.sun, dtype=np.float32)[:, None]
+        + np.float32(light.ambient) * open_sky * _SKY_COLOUR,
+        dtype=np.float32,
     )
 
 

@@ -36,6 +36,7 @@ class Material(IntEnum):
     WOOD = 11
     LAMP = 12
     POSTER = 13
+    LIGHT = 14
 
 
 _BOX, _CYLINDER, _ELLIPSOID, _LEAVES = (int(k) for k in (*Shape, Material.LEAVES))
@@ -237,9 +238,7 @@ class Solids:
         self, index: int, start: tuple[F32, F32, F32], u: F32, enter: F32, grain: F32
     ) -> NDArray[np.bool_]:
         """Whether a ray that enters a railing meets a bar: uprights between two rails, a lattice or planks."""
-        along, up = (
-            (start[i] + enter * u[i] + 1) * np.float32(self.half[index, i]) for i in (0, 2)
-        )
+        along, up = ((start[i] + enter * u[i] + 1) * np.float32(self.half[index, i]) for i in (0, 2))
         k = len(grain) - 1
         kind, pitch, bar = (float(grain[(37 * index) & k, (61 * j) & k]) for j in range(3))
         rails = (np.abs(up - 0.15) < 0.03) | (2 * np.float32(self.half[index, 2]) - up < 0.06)

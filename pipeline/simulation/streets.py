@@ -148,7 +148,9 @@ def _town_side(
         s += length + float(rng.choice([0.0, 0.1, 3.0, 9.0]))
     if rng.random() < 0.7:
         for s_tree in places_along(p, p.tree_spacing, rng):
-            place, _ = ground_at(surface, s_tree, side * (surface.kerb_left + rng.uniform(0.5, surface.pavement)))
+            place, _ = ground_at(
+                surface, s_tree, side * (surface.kerb_left + rng.uniform(0.5, surface.pavement))
+            )
             solids += clutter.tree(place, rng)
     return solids
 
@@ -212,9 +214,7 @@ def _country_side(
     return solids
 
 
-def _strewn(
-    surface: RoadSurface, p: SceneParameters, side: float, rng: np.random.Generator
-) -> list[Solid]:
+def _strewn(surface: RoadSurface, p: SceneParameters, side: float, rng: np.random.Generator) -> list[Solid]:
     """People, boxes, hoardings and bushes here and there."""
     wide = max(surface.pavement, 2.0)
     things: list[tuple[float, Callable[[Floats, float], list[Solid]]]] = [

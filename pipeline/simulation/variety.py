@@ -74,12 +74,12 @@ def draw_variety(rng: np.random.Generator) -> Variety:
     snow = float(rng.uniform(0.1, 1.0)) if rng.random() < 0.05 else 0.0
     camera, _ = draw_camera(rng)
     tilt = np.radians(rng.normal([0.0, 1.0, 0.0], [1.2, 2.5, 3.5]))
-    # Cameras that look aside or back see poles too.
-    if rng.random() < 0.15:
+    # Cameras that look aside or back see poles too; out of town they would mostly see grass.
+    if parameters.town and rng.random() < 0.15:
         tilt[2] = rng.uniform(-math.pi, math.pi)
     night = weather.night
     look = Look(
-        grey=float(rng.uniform(75.0, 140.0) * (1.0 - 0.45 * night)),
+        grey=float(rng.uniform(80.0, 150.0) * (1.0 - 0.45 * night)),
         blur=float(rng.uniform(0.35, 1.0)),
         vignetting=float(rng.uniform(0.0, 0.4)),
         noise=float(rng.uniform(0.5, 3.0) + 3.0 * night),
@@ -156,7 +156,7 @@ def _draw_hour(overcast: float, rng: np.random.Generator) -> tuple[Light, Weathe
         sight=sight or float(rng.uniform(300.0, 1500.0)),
         night=night,
         wet=wet,
-        painted_sky=True,
+        glossy=True,
         billows=float(np.exp(rng.uniform(math.log(0.3), math.log(2.5)))),
         glow=(0.80 - 0.3 * warm, 0.78 - 0.08 * warm, 0.76 + 0.1 * warm),
         sun=(0.84 - 0.4 * warm, 0.96 - 0.15 * warm, 1.05 + 0.15 * warm),
@@ -205,10 +205,11 @@ def picture(variety: Variety, rng: np.random.Generator) -> tuple[Picture, Scene]
         lamps = lamps_of(scene.standing, T_world_cam[:3, 3])
         scene = replace(scene, weather=replace(scene.weather, lamps=lamps))
     ahead = math.cos(variety.tilt[2])
-    reach = (float(place[0]) - (20.0 if ahead > 0.5 else 100.0), float(place[0]) + (110.0 if ahead > -0.5 else 20.0))
-    optics = optics_of(variety.camera)
-    shown = render(
-        scene, shadow_map(scene, reach), optics, T_world_cam, time=0.0, look=variety.look, rng=rng
+    reach = (
+        float(place[0]) - (20.0 if ahead > 0.5 else 100.0),
+        float(place[0]) + (110.0 if ahead > -0.5 else 20.0),
     )
+    optics = optics_of(variety.camera)
+    shown = render(scene, shadow_map(scene, reach), optics, T_world_cam, time=0.0, look=variety.look, rng=rng)
     pixels, classes = seen_through(variety.screen, shown.image.pixels, shown.labels, rng)
     return Picture(CameraImage(pixels), classes), scene

@@ -34,7 +34,7 @@ class Weather:
         sight: Contrast falls to 37 % over this distance, m.
         night: 0 day, 1 dark.
         wet: 0 dry, 1 under water.
-        painted_sky: Clouds of several kinds, with hard edges too, instead of a plain cover.
+        glossy: Roads glare against the sun, and the sky has a sun and clouds of several kinds.
         billows: Size of the clouds relative to the usual.
         glow: Colour of the sky at the horizon, linear BGR.
         sun: Colour of sunlight, linear BGR.
@@ -44,7 +44,7 @@ class Weather:
     sight: float = CLEAR_M
     night: float = 0.0
     wet: float = 0.0
-    painted_sky: bool = False
+    glossy: bool = False
     billows: float = 1.0
     glow: tuple[float, float, float] = (0.80, 0.78, 0.76)
     sun: tuple[float, float, float] = (0.84, 0.96, 1.05)
@@ -54,14 +54,27 @@ class Weather:
         object.__setattr__(self, "lamps", read_only(self.lamps))
 
 
-def sky(weather: Weather, textures: Textures, direction: F32, overcast: float) -> F32:
-    """Radiance (3,N) of the sky along directions (3,N): a gradient and clouds in layers, dark at night."""
+def sky(weather: Weather, textures: Textures, direction: F32, sun: Floats, overcast: float) -> F32:
+    """Radiance (3,N) of the sky: a gradient, the sun, clouds in layers; dark at night.
+
+    Args:
+        weather: Hour and weather.
+        textures: Noise tables.
+        direction: float32 (3,N), world, of any length.
+        sun: float64 (3,), unit vector towards it.
+        overcast: 0 clear, 1 grey.
+    """
     d = direction / np.sqrt((direction * direction).sum(axis=0))
     rise = np.maximum(d[2], np.float32(0.005))
     pale = np.exp(-3.5 * rise)
     horizon = np.array(weather.glow, dtype=np.float32)[:, None] * np.float32(0.9 + 0.3 * overcast)
     zenith = np.array([[0.75], [0.42], [0.22]], dtype=np.float32)
     blue = pale * horizon + (1.0 - pale) * zenith
+    toward = sun.astype(np.float32) @ d
+    # The disc is half a degree wide; the air about it is bright for some degrees.
+    blue += (
+        40.0 * (toward > 0.99998) + 0.9 * np.maximum(toward, 0.0) ** 160 + 0.3 * np.maximum(toward, 0.0) ** 12
+    )
     far = np.float32(2.2 * weather.billows) / (rise + np.float32(0.06))
     u, v = d[0] * far, d[1] * far
     cloud = smooth(textures.rough, u, v, 0.9) + 0.45 * smooth(textures.rough, u + 9.0, v, 3.7)
@@ -111,6 +124,8 @@ def head_light(weather: Weather, direction: F32, depth: F32, facing: F32) -> F32
         depth: float32 (N,), m.
         facing: float32 (N,), cosine between surface and view; a road is lit at a flat angle.
     """
-    spread = np.exp(-((direction[0] / 0.45) ** 2)) * np.exp(-((np.minimum(direction[1] - 0.05, 0.0) / 0.09) ** 2))
+    spread = np.exp(-((direction[0] / 0.45) ** 2)) * np.exp(
+        -((np.minimum(direction[1] - 0.05, 0.0) / 0.09) ** 2)
+    )
     beam = 160.0 * spread * np.maximum(facing, np.float32(0.02)) / (depth * depth + 25.0)
     return np.asarray(np.float32(weather.night) * beam * _BEAM, dtype=np.float32)

@@ -105,12 +105,12 @@ def _clutter(shape: tuple[int, int], rng: np.random.Generator) -> F32:
         middle = rng.uniform((0.0, 0.4), (1.0, 1.05)) * (width, height)
         corners = middle + rng.normal(0.0, 0.16, (5, 2)) * (width, 0.6 * height)
         cv2.fillConvexPoly(veil, cv2.convexHull(corners.astype(np.int32)), float(rng.uniform(0.2, 1.0)))
-    return np.asarray(cv2.GaussianBlur(veil, (0, 0), float(rng.uniform(0.002, 0.02)) * width), dtype=np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(veil, (0, 0), float(rng.uniform(0.002, 0.02)) * width), dtype=np.float32
+    )
 
 
-def _bonnet(
-    shown: F32, classes: Pixels, share: float, rng: np.random.Generator
-) -> tuple[F32, Pixels]:
+def _bonnet(shown: F32, classes: Pixels, share: float, rng: np.random.Generator) -> tuple[F32, Pixels]:
     """The own bonnet: painted, mirroring what is above it, with a fold or two; its pixels are not labelled."""
     height, width = shown.shape[:2]
     u = np.linspace(-1.0, 1.0, width, dtype=np.float32)
@@ -127,7 +127,7 @@ def _bonnet(
     paint = tone.astype(np.float32) * (1.0 + 0.2 * np.abs(u))[None, :, None]
     drawn = paint * (1.0 - mirror) + mirror * mirrored
     for place in rng.uniform(-0.8, 0.8, int(rng.integers(0, 3))):
-        drawn *= (1.0 - 0.3 * np.exp(-(((u - place) * width / 2) / 2.0) ** 2))[None, :, None]
+        drawn *= (1.0 - 0.3 * np.exp(-((((u - place) * width / 2) / 2.0) ** 2)))[None, :, None]
     hidden = classes.copy()
     hidden[inside] = labels.IGNORE
     return np.where(inside[:, :, None], drawn, shown), hidden

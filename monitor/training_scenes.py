@@ -58,8 +58,8 @@ def write_scenes(folder: Path, count: int, seed: int, workers: int) -> None:
             "source": "simulated streets (calibwatch)",
             "licence": "Apache-2.0",
             "labelled_classes": list(range(len(labels.NAMES))),
-            "unlabelled_notes": "all classes, exact; people, pavement, kerbs and wires are 0, tree trunks and "
-            "boughs 6, fences with their stakes 5; 255 on the own bonnet and on paint worn by two thirds or more",
+            "unlabelled_notes": "all classes, exact; people, pavement, kerbs, wires are 0, trunks 6, fences "
+            "with their stakes 5; 255 on the own bonnet and on paint worn by two thirds or more",
             "cameras": "drawn: twelve image sizes, focal length 0.45 to 2.2 widths, some with distortion",
             "splits": {
                 "train": [name for k, name in enumerate(identifiers) if k % VALIDATION_EVERY],

@@ -227,7 +227,7 @@ def _extent(flags: NDArray[np.bool_]) -> slice:
 
 
 def _voted(votes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The class with most votes in each row of (N,4), the thinner one of equals; what is unsure comes last."""
+    """The class with most votes in each row of (N,4), the thinner one of equals; the unsure last."""
     candidates = np.array([*range(len(labels.NAMES)), labels.IGNORE], dtype=np.uint8)
     score = np.stack([16 * (votes == k).sum(axis=1) + r for k, r in zip(candidates, _RANK, strict=True)])
     # A class without a vote must not win by its rank.

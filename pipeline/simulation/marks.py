@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from pipeline.simulation.roadway import GRASS, Bgr, Blot, Ribbon, Roadway
 from pipeline.simulation.paint import WHITE, YELLOW, Line, Paint, Patch, Stroke
+from pipeline.simulation.roadway import GRASS, Bgr, Blot, Ribbon, Roadway
 from pipeline.simulation.scene import SceneParameters
 
 _GLYPHS = {
@@ -88,7 +88,7 @@ def _middle(d: float, p: SceneParameters, phase: float, colour: int, rng: np.ran
 
 
 def _junction(p: SceneParameters, s: float, rng: np.random.Generator) -> tuple[list[Patch], list[Stroke]]:
-    """A stop line, dashed or whole, a crossing of bars, of two lines or none, arrows in the lanes before it."""
+    """A stop line, a crossing of bars, of two lines or none, arrows in the lanes before it."""
     edge, forward = p.lanes * p.lane_width / 2, (p.lanes + 1) // 2
     patches: list[Patch] = []
     strokes: list[Stroke] = []
@@ -232,16 +232,16 @@ def draw_flaws(p: SceneParameters, kerb: float, snow: float, rng: np.random.Gene
                 d, float(rng.uniform(0.02, 0.13)), gain, float(rng.uniform(0.0, 0.2)), (first, first + 90.0)
             )
         )
-    for _ in range(int(rng.poisson(1.5))):
-        ribbons.append(
-            Ribbon(
-                float(rng.uniform(-wide, wide)),
-                float(rng.uniform(0.02, 0.1)),
-                float(rng.choice([0.4, 1.4])),
-                float(rng.uniform(0.3, 1.2)),
-                (-20.0, 120.0),
-            )
+    ribbons += [
+        Ribbon(
+            float(rng.uniform(-wide, wide)),
+            float(rng.uniform(0.02, 0.1)),
+            float(rng.choice([0.4, 1.4])),
+            float(rng.uniform(0.3, 1.2)),
+            (-20.0, 120.0),
         )
+        for _ in range(int(rng.poisson(1.5)))
+    ]
     for k in range(p.lanes):
         if rng.random() < 0.5:
             d, gain = -edge + (k + 0.5) * p.lane_width, float(np.exp(rng.normal(0.0, 0.18)))

@@ -61,7 +61,7 @@ def paint_materials(s: Surfaces, albedo: F32) -> None:
 
 
 def glows(s: Surfaces, night: float) -> F32:
-    """Light that points give off, (N,): lamps by day a little, at night much, and windows with light behind."""
+    """Light that points give off, (N,): lamps by day a little, at night much, and lit windows."""
     light = np.zeros(s.material.shape, dtype=np.float32)
     lamps = s.of(Material.LAMP)
     light[lamps] = np.float32(0.3 + 14.0 * night)
@@ -207,7 +207,7 @@ def _cells(s: Surfaces, k: NDArray[np.int64]) -> _Cells:
 
 
 def _front(s: Surfaces, albedo: F32) -> None:
-    """Brick or plaster, cornices, pilasters, downpipes, windows with frames, bars and sills, shops and doors."""
+    """Brick or plaster, cornices, pilasters, downpipes, windows with frames and bars, shops, doors."""
     k = s.of(Material.FRONT)
     if not k.size:
         return

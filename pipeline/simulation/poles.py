@@ -1,12 +1,13 @@
-"""Poles of every kind that stands along roads: lamp posts, sign posts, signals, gantries, utility poles, bollards.
+"""Poles of every kind along roads: lamp posts, sign posts, signals, gantries, utility poles, bollards.
 
-Every function takes the place on the ground (3,), the heading of the road there and a generator. What carries is
-labelled pole, what is carried is sign; wires belong to nothing.
+Every function takes the place on the ground (3,), the heading of the road there and a generator. What
+carries is labelled pole, what is carried is sign; wires belong to nothing.
 """
 # ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -99,10 +100,7 @@ def _bent(top: Floats, way: Floats, size: tuple[float, float], radius: float, co
     angle = np.linspace(0.0, math.pi / 2, 5)
     places = top + np.outer(size[0] * (1.0 - np.cos(angle)), way)
     places[:, 2] += size[1] * np.sin(angle)
-    return [
-        bar(a, b, radius, labels.POLE, colour, reflectance=0.35)
-        for a, b in zip(places[:-1], places[1:], strict=True)
-    ]
+    return [bar(a, b, radius, labels.POLE, colour, reflectance=0.35) for a, b in pairwise(places)]
 
 
 def plate(place: Floats, facing: float, half: tuple[float, float], rng: np.random.Generator) -> Solid:
@@ -248,7 +246,7 @@ def utility_poles(grounds: list[Floats], heading: float, rng: np.random.Generato
                 )
             )
         tops.append(ends)
-    for first, second in zip(tops[:-1], tops[1:], strict=True):
+    for first, second in pairwise(tops):
         for a, b in zip(first[:3], second[:3], strict=True):
             parts += _wire(a, b)
     return parts

@@ -1,4 +1,4 @@
-"""What a wet road mirrors: the street seen from below, by a camera mirrored at the road's plane, half as fine."""
+"""What a wet road mirrors: the street as a camera sees it that is itself mirrored at the road's plane."""
 
 from dataclasses import dataclass, replace
 

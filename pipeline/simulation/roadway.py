@@ -1,4 +1,4 @@
-"""What a road is made of and bears besides paint: seams, cracks, tracks, repairs, joints, stones, kerbs, verges."""
+"""What a road is made of and bears besides paint: seams, cracks, tracks, repairs, stones, kerbs, verges."""
 # ruff: noqa: PLR2004 - the figures are patterns on the ground, in m
 
 import math
@@ -117,7 +117,7 @@ class Roadway:
             albedo[:, torn] *= np.float32(0.4)
 
     def worn(self, s: F32, d: F32, textures: Textures) -> F32:
-        """Share 0..1 of the paint that is left at road points (N,): patches scrubbed off down to the stones."""
+        """Share 0..1 of the paint that is left at road points (N,); in patches it is scrubbed off."""
         if self.wear == 0.0:
             return np.ones(s.shape, dtype=np.float32)
         level = 0.55 * smooth(textures.rough, s, d, 2.5) + 0.6 * sample(textures.fine, s, d, 14.0)

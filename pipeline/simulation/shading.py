@@ -25,7 +25,7 @@ _AIR_M = 60.0
 """m; height of the haze over the ground."""
 _SNOW = np.array([[0.86], [0.84], [0.82]], dtype=np.float32)
 _GONE, _LEFT = 0.15, 0.35
-"""Share of paint that is left below which it is road, and above which it is a mark; between them, who knows."""
+"""Share of paint that is left below which it is road, and above which it is a mark; between, who knows."""
 _BODY_M = 1.2
 """m; half length from which a part of a vehicle keeps the sky from the ground."""
 _CONTACT_M = 0.22
@@ -172,7 +172,7 @@ def _paint(
     grain: tuple[F32, F32, F32],
     drawn: tuple[F32, NDArray[np.uint8]],
 ) -> None:
-    """Puts paint on the ground: road coordinates, colours of the paint, grain; albedo and classes in place."""
+    """Puts paint on the ground: road coordinates, its colours, grain; albedo and classes in place."""
     albedo, classes = drawn
     painted = np.flatnonzero(paint)
     roadway = view.scene.roadway

@@ -48,6 +48,10 @@ CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 
 _RAGGED = 0.55
 """Half chord of the unit ball below which rays may pass between leaves."""
+_MESH_SHARE, _PLANK_SHARE = 0.25, 0.3
+"""Of all railings; the rest has uprights 1 to 9 cm wide."""
+_RAIL_AT_M, _RAIL_M, _MESH_M, _WIRE_M = 0.15, 0.06, 0.12, 0.014
+"""m; height of the lower rail of a railing, thickness of its rails, cells and wires of a mesh."""
 _LOOSE = 1.15
 """The same for a canopy, whose outline is torn and through which the sky is seen here and there."""
 
@@ -237,16 +241,16 @@ class Solids:
     def _barred(
         self, index: int, start: tuple[F32, F32, F32], u: F32, enter: F32, grain: F32
     ) -> NDArray[np.bool_]:
-        """Whether a ray that enters a railing meets a bar: uprights between two rails, a lattice or planks."""
+        """Whether a ray that enters a railing meets it: uprights between two rails, planks or wire mesh."""
         along, up = ((start[i] + enter * u[i] + 1) * np.float32(self.half[index, i]) for i in (0, 2))
         k = len(grain) - 1
         kind, pitch, bar = (float(grain[(37 * index) & k, (61 * j) & k]) for j in range(3))
-        rails = (np.abs(up - 0.15) < 0.03) | (2 * np.float32(self.half[index, 2]) - up < 0.06)
-        if kind < 0.3:
+        rails = (np.abs(up - _RAIL_AT_M) < _RAIL_M / 2) | (2 * np.float32(self.half[index, 2]) - up < _RAIL_M)
+        if kind < _MESH_SHARE:
+            wires = [np.mod(way, _MESH_M) < _WIRE_M for way in (along + up, along - up)]
+            return np.asarray(wires[0] | wires[1] | rails)
+        if kind < _MESH_SHARE + _PLANK_SHARE:
             pitch, bar = 0.10 + 0.05 * pitch, 0.84
-        elif kind < 0.55:
-            cells = (np.mod(along + up, 0.12) < 0.014) | (np.mod(along - up, 0.12) < 0.014)
-            return np.asarray(cells | rails | (np.mod(along, 2.5) < 0.06))
         else:
             pitch, bar = 0.09 + 0.16 * pitch, 0.12 + 0.25 * bar
         return np.asarray((np.mod(along, pitch) < bar * pitch) | rails)

@@ -1,13 +1,12 @@
-"""Streets of many kinds for training: town, suburb, country road, motorway, with all that is taken for a pole."""
+"""Streets of many kinds for training: towns and country roads with all that is taken for a pole."""
 # ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline import labels
-from pipeline.records import Floats
 from pipeline.simulation import clutter, poles
 from pipeline.simulation.furniture import panel
 from pipeline.simulation.marks import draw_flaws, draw_paint
@@ -26,6 +25,11 @@ from pipeline.simulation.solids import Solid, Solids
 from pipeline.simulation.surface import RoadSurface, draw_surface
 from pipeline.simulation.textures import draw_textures
 from pipeline.simulation.weather import Weather
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.records import Floats
 
 
 def draw_street(
@@ -90,7 +94,7 @@ def _lean(p: SceneParameters, rng: np.random.Generator) -> tuple[float, float]:
 def _posts(
     surface: RoadSurface, p: SceneParameters, side: float, crossings: list[float], rng: np.random.Generator
 ) -> list[Solid]:
-    """Lamps, signs, signals, utility poles and bollards along one side."""
+    """Everything that is labelled pole along one side."""
     kerb, solids = surface.kerb_left, list[Solid]()
     aside = kerb + float(rng.uniform(0.2, 1.5))
     if rng.random() < (0.85 if p.town else 0.45):
@@ -103,15 +107,29 @@ def _posts(
             solids += poles.board(place, heading, rng)
         else:
             solids += poles.signed_post(place, heading, _lean(p, rng), rng)
+    if rng.random() < (0.2 if p.town else 0.4):
+        left = side * (kerb + float(rng.uniform(0.8, 6.0)))
+        row = [ground_at(surface, s, left) for s in places_along(p, float(rng.uniform(25.0, 45.0)), rng, 0.1)]
+        solids += poles.utility_poles([place for place, _ in row], row[0][1], rng)
+    return solids + _signals(surface, p, side, crossings, rng) + _bollards(surface, p, side, rng)
+
+
+def _signals(
+    surface: RoadSurface, p: SceneParameters, side: float, crossings: list[float], rng: np.random.Generator
+) -> list[Solid]:
+    """Traffic lights before and behind crossings along one side."""
+    kerb, solids = surface.kerb_left, list[Solid]()
     for s in crossings:
         for off in (-1.5, float(rng.uniform(4.0, 12.0))):
             if rng.random() < 0.55:
                 place, heading = ground_at(surface, s + off, side * (kerb + rng.uniform(0.3, 1.0)))
                 solids += poles.signal(place, heading, side, _lean(p, rng), rng)
-    if rng.random() < (0.2 if p.town else 0.4):
-        left = side * (kerb + float(rng.uniform(0.8, 6.0)))
-        row = [ground_at(surface, s, left) for s in places_along(p, float(rng.uniform(25.0, 45.0)), rng, 0.1)]
-        solids += poles.utility_poles([place for place, _ in row], row[0][1], rng)
+    return solids
+
+
+def _bollards(surface: RoadSurface, p: SceneParameters, side: float, rng: np.random.Generator) -> list[Solid]:
+    """Rows of bollards or marker posts along one side."""
+    kerb, solids = surface.kerb_left, list[Solid]()
     for _ in range(int(rng.poisson(1.2))):
         start, pitch = float(rng.uniform(-10.0, 80.0)), float(rng.uniform(1.2, 8.0))
         left = side * (kerb + float(rng.uniform(0.2, 0.8)))
@@ -185,6 +203,26 @@ def _country_side(
         for s in stretches[stretches > first]:
             place, heading = ground_at(surface, float(s), side * (kerb + 0.5))
             solids += clutter.guard_rail(place, heading, 8.0, rng)
+    solids += _edge_of_fields(surface, p, side, rng)
+    for s in places_along(p, max(p.tree_spacing, 12.0), rng):
+        place, heading = ground_at(surface, s, side * (kerb + rng.uniform(2.0, 20.0)))
+        draw = rng.random()
+        if draw < 0.5:
+            solids += clutter.tree(place, rng)
+        elif draw < 0.9:
+            solids += clutter.thicket(place, float(rng.uniform(0.5, 2.0)), rng)
+        else:
+            far = ground_at(surface, s, side * (kerb + 22.0))[0]
+            solids += clutter.house(far, heading, (14.0, 9.0, 6.0), rng)
+    return solids
+
+
+def _edge_of_fields(
+    surface: RoadSurface, p: SceneParameters, side: float, rng: np.random.Generator
+) -> list[Solid]:
+    """A wood, a noise barrier, a fence or nothing along a road out of town."""
+    kerb, solids = surface.kerb_left, list[Solid]()
+    stretches = np.arange(-30.0, min(p.length, 130.0), 8.0)
     kind = rng.random()
     if kind < 0.35:
         depth = float(rng.uniform(2.0, 9.0))
@@ -201,16 +239,6 @@ def _country_side(
         left = side * (kerb + float(rng.uniform(1.5, 6.0)))
         for s in stretches:
             solids += clutter.fence(*ground_at(surface, float(s), left), 8.0, rng)
-    for s in places_along(p, max(p.tree_spacing, 12.0), rng):
-        place, heading = ground_at(surface, s, side * (kerb + rng.uniform(2.0, 20.0)))
-        draw = rng.random()
-        if draw < 0.5:
-            solids += clutter.tree(place, rng)
-        elif draw < 0.9:
-            solids += clutter.thicket(place, float(rng.uniform(0.5, 2.0)), rng)
-        else:
-            far = ground_at(surface, s, side * (kerb + 22.0))[0]
-            solids += clutter.house(far, heading, (14.0, 9.0, 6.0), rng)
     return solids
 
 

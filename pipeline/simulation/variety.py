@@ -1,4 +1,4 @@
-"""Streets, cameras, hours, weather and sensors of all kinds, drawn from a seed: what a network should have seen."""
+"""Streets, cameras, weather and sensors of all kinds, drawn from a seed: what a network should have seen."""
 # ruff: noqa: PLR2004 - the figures are odds of a draw, each beside what it decides
 
 import math
@@ -70,7 +70,7 @@ class Variety:
 def draw_variety(rng: np.random.Generator) -> Variety:
     """Draws what the next picture shows and by which camera."""
     parameters = _draw_parameters(rng)
-    light, weather, rain = _draw_hour(parameters.overcast, rng)
+    light, weather, rain = _draw_hour(parameters, rng)
     snow = float(rng.uniform(0.1, 1.0)) if rng.random() < 0.05 else 0.0
     camera, _ = draw_camera(rng)
     tilt = np.radians(rng.normal([0.0, 1.0, 0.0], [1.2, 2.5, 3.5]))
@@ -129,10 +129,9 @@ def _draw_parameters(rng: np.random.Generator) -> SceneParameters:
     )
 
 
-def _draw_hour(overcast: float, rng: np.random.Generator) -> tuple[Light, Weather, bool]:
+def _draw_hour(p: SceneParameters, rng: np.random.Generator) -> tuple[Light, Weather, bool]:
     """Sun, sky and weather, and whether it rains."""
-    kind = rng.random()
-    night = 0.0
+    kind, overcast, night = rng.random(), p.overcast, 0.0
     if kind < 0.07:
         night = float(rng.uniform(0.85, 1.0))
     elif kind < 0.13:
@@ -144,8 +143,8 @@ def _draw_hour(overcast: float, rng: np.random.Generator) -> tuple[Light, Weathe
     sight = float(np.exp(rng.uniform(math.log(25.0), math.log(250.0)))) if rng.random() < 0.1 else 0.0
     if sight:
         overcast = max(overcast, 0.8)
-    azimuth, low = float(rng.uniform(0.0, 2.0 * math.pi)), float(rng.uniform(6.0, 65.0))
-    sun = np.array([math.cos(azimuth), math.sin(azimuth), math.tan(math.radians(low))])
+    azimuth, low = float(rng.uniform(0.0, 2.0 * math.pi)), math.degrees(p.sun_elevation)
+    sun = np.array([math.cos(azimuth), math.sin(azimuth), math.tan(p.sun_elevation)])
     day = (1.0 - night) ** 2
     direct = (1.0 - overcast) * float(rng.uniform(0.8, 1.8)) * (day if night < 0.3 else 0.0)
     ambient = (0.35 + 0.35 * overcast) * day + 0.012 * night

@@ -1,4 +1,4 @@
-"""What lies between street and lens: bonnet, reflection of the dashboard, drops and streaks of rain, snow flakes."""
+"""What lies between street and lens: bonnet, mirrored dashboard, drops and streaks of rain, snow."""
 # ruff: noqa: PLR2004 - the figures are odds of a draw and shares of the image
 
 from dataclasses import dataclass
@@ -111,7 +111,7 @@ def _clutter(shape: tuple[int, int], rng: np.random.Generator) -> F32:
 
 
 def _bonnet(shown: F32, classes: Pixels, share: float, rng: np.random.Generator) -> tuple[F32, Pixels]:
-    """The own bonnet: painted, mirroring what is above it, with a fold or two; its pixels are not labelled."""
+    """The own bonnet: painted, mirroring what is above it, with a fold or two; it is not labelled."""
     height, width = shown.shape[:2]
     u = np.linspace(-1.0, 1.0, width, dtype=np.float32)
     round_, tilt = float(rng.uniform(0.2, 0.9)), float(rng.normal(0.0, 0.1))

@@ -18,6 +18,7 @@ from pipeline.errors import CalibwatchError
 COMMANDS = {
     "calibrate": "The extrinsic of a recording or a single frame, and how good it is.",
     "demo": "Simulate a drive in which the camera mount slips, and watch it being told.",
+    "evaluate": "Measure calibwatch on data whose truth is known.",
     "extrinsic": "Read extrinsics of other formats into a rig file.",
     "inspect": "What a recording holds, which pairs could be watched, and what is missing.",
     "masks": "Find lane paint and poles in image files, as the watch sees them.",

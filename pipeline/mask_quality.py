@@ -190,12 +190,7 @@ def _share(part: Floats, whole: Floats) -> Floats:
 
 def _near(mask: Bools, slack: float) -> Bools:
     """Pixels whose distance to the next pixel of the mask is at most ``slack``, px."""
-    if not mask.any():
-        return np.zeros_like(mask)
-    outside = np.where(mask, 0, 1).astype(np.uint8)
-    distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(distance <= slack + _ROUNDING_PX, dtype=np.bool_)
-
-
-_ROUNDING_PX = 1e-4
-"""Of square roots in single precision; squares of distances are whole numbers, so nothing lies in between."""
+    reach = int(slack)
+    away = np.arange(-reach, reach + 1)
+    disc = (away[:, None] ** 2 + away[None] ** 2 <= slack**2).astype(np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc), dtype=np.bool_)

@@ -10,7 +10,7 @@ OUT ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: env demo test test-full lint bench train export scenes clean
+.PHONY: env demo test test-full lint bench train export scenes figures-masks clean
 
 env: $(STAMP)
 
@@ -57,6 +57,9 @@ train: $(TRAIN)/.installed
 
 export: $(TRAIN)/.installed
 	$(TRAIN)/bin/python -m models.export --checkpoint training/run/checkpoint.pt --out models/bisenetv2.onnx --version $(MODEL_VERSION)
+
+figures-masks: env
+	$(BIN)/calibwatch evaluate masks $(DATA) --out $(OUT)/masks
 
 clean:
 	rm -rf $(VENV) $(TRAIN) $(OUT) build *.egg-info

@@ -1,4 +1,4 @@
-"""Class probabilities of the network -> lane and pole masks: CRF, thresholds, the horizon, least sizes."""
+"""Class probabilities of the network -> lane and pole masks: CRF, thresholds, horizon, which pieces stay."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline import labels
 from pipeline.crf import AppearanceKernel, CrfParameters, SmoothnessKernel, mean_field
 from pipeline.errors import InputError, RigError
+from pipeline.mask_pieces import pieces_of
 from pipeline.records import CameraModel, Floats, Masks
 
 Floats32: TypeAlias = NDArray[np.float32]
@@ -21,13 +22,43 @@ REFERENCE_WIDTH_PX = 1242
 """px; lengths below are those of an image of this width and grow with the image."""
 
 
-def _gentle_crf() -> CrfParameters:
-    return CrfParameters(
-        smoothness=SmoothnessKernel(sigma_x_px=3.0, sigma_y_px=3.0, compat=1.0),
-        appearance=AppearanceKernel(
-            sigma_x_px=20.0, sigma_y_px=20.0, sigma_colour=(13.0, 13.0, 13.0), compat=3.0
-        ),
-        iterations=5,
+@dataclass(frozen=True, slots=True, eq=False)
+class ClassCrf:
+    """How one class is told from all others by its neighbourhood.
+
+    Attributes:
+        crf: The CRF over the class and the rest, in this order; widths in px of the reference width.
+        threshold: Least marginal that makes a mask, 0..1. Lower than the network's: a thin thing has more
+            neighbours of other classes than of its own, so that its marginals fall; at these thresholds as
+            much of it is found as without the CRF.
+    """
+
+    crf: CrfParameters
+    threshold: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.threshold <= 1.0:
+            raise RigError(f"masks: threshold {self.threshold} after the CRF is no share", hint="0..1")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskCrf:
+    """The CRFs of lane and pole, each for itself: hardly a pixel could be both. None: as the network says."""
+
+    lane: ClassCrf | None
+    pole: ClassCrf | None
+
+
+def _appearance(compat: float) -> AppearanceKernel:
+    """40 px: as far as one road or wall has one colour; 13 grey levels: a camera's noise, and shading."""
+    return AppearanceKernel(sigma_x_px=40.0, sigma_y_px=40.0, sigma_colour=(13.0, 13.0, 13.0), compat=compat)
+
+
+def _default_crf() -> MaskCrf:
+    """Appearance alone: smoothness, isotropic or upright, lowers the precision of both classes."""
+    return MaskCrf(
+        lane=ClassCrf(CrfParameters(None, _appearance(3.0)), threshold=0.2),
+        pole=ClassCrf(CrfParameters(None, _appearance(3.0), class_weights=(1.0, 0.5)), threshold=0.15),
     )
 
 
@@ -36,42 +67,62 @@ class MaskParameters:
     """How probabilities become masks. All px are px of an image ``REFERENCE_WIDTH_PX`` wide.
 
     Attributes:
-        lane_threshold: Least probability of paint, 0..1. One half: what is more likely paint than anything
-            else together; the largest class alone paints too wide where three classes share a pixel.
+        lane_threshold: Least probability of paint, 0..1, where no CRF takes part. One half: what is more
+            likely paint than anything else together; the largest class alone paints too wide where three
+            classes share a pixel.
         pole_threshold: Likewise for poles, whose cells are mostly covered in part: best between 0.2 and 0.4
             on the pictures that the network was trained on.
-        crf: Kernel widths in px of the reference width, or None: the network's probabilities as they are. The
-            default is gentle: weight 10 and widths of 80 px, common for large objects, take away poles of up
-            to 8 px whose contrast is below 20 grey levels although the network saw every pixel of them.
-        evidence: Least probability of paint or pole that lets a pixel take part in the CRF; to one half it is
-            2.9 nats from there, three quarters of what full agreement under the default kernels could add.
-        reach_sigmas: Pixels within this many appearance widths of evidence take part in the CRF; beyond two a
-            pixel weighs less than an eighth of a near one.
-        pole_keep: Least share of a pole's pixels, 0..1, that the CRF must leave, or the network's own mask
-            stands: the CRF may trim a pole to its contour, not delete it.
+        crf: The CRFs, or None: the network's probabilities as they are. The common setting for large objects
+            (weight 10, 80 px, with smoothness) takes away poles of up to 8 px.
+        evidence: Least probability of a class that lets a pixel change by its CRF; from there to one half are
+            2.9 nats, all that full agreement under the default kernels could add.
+        margin_px: Pixels this near to evidence change too.
+        pole_sure: A pole of which the network gives some cell this probability is no mistake of a few cells:
+            the CRF may trim it to its contour, not delete it.
+        pole_keep: Least share of a sure pole's pixels, 0..1, that the CRF must leave, or the network's own
+            mask stands.
+        lane_peak: Least probability by the network of a patch of paint's surest cell, 0..1. Of the patches
+            below 0.6 a third was paint.
+        pole_peak: Likewise for poles. Of the pieces below 0.4 a quarter was a pole.
+        lane_road: Least mean probability of road around a patch of paint, 0..1: paint lies on a road. Of the
+            patches below 0.3 one in a thousand was paint, even at a frame's lower border.
         lane_least_px2: Smallest patch of paint, px^2: a dash 3 m long at 30 m under a camera 1.65 m high.
         pole_least_px2: Smallest piece of pole, px^2: 2 px wide, 12 px tall (1 m at 50 m).
+        pole_least_px: Shortest piece of pole, px along its box's diagonal: half a pixel at each end turns the
+            line of a shorter one by more than 3 deg, and but a quarter of them were poles.
         horizon_slack_px: Paint may lie this far above the horizon, px: 2 deg of pitch and slope at 720 px
             focal length.
     """
 
     lane_threshold: float = 0.5
     pole_threshold: float = 0.3
-    crf: CrfParameters | None = field(default_factory=_gentle_crf)
+    crf: MaskCrf | None = field(default_factory=_default_crf)
     evidence: float = 0.05
-    reach_sigmas: float = 2.0
+    margin_px: float = 3.0
+    pole_sure: float = 0.5
     pole_keep: float = 0.5
+    lane_peak: float = 0.6
+    pole_peak: float = 0.4
+    lane_road: float = 0.3
     lane_least_px2: float = 12.0
     pole_least_px2: float = 24.0
+    pole_least_px: float = 16.0
     horizon_slack_px: float = 25.0
 
     def __post_init__(self) -> None:
-        for name in ("lane_threshold", "pole_threshold", "evidence", "pole_keep"):
+        for name in _SHARES:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise RigError(f"masks: {name} {getattr(self, name)} is no share", hint="0..1")
-        for name in ("reach_sigmas", "lane_least_px2", "pole_least_px2", "horizon_slack_px"):
+        for name in _LENGTHS:
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise RigError(f"masks: {name} {getattr(self, name)} is negative or not finite")
+
+
+_SHARES = (
+    *("lane_threshold", "pole_threshold", "evidence", "pole_sure", "pole_keep"),
+    *("lane_peak", "pole_peak", "lane_road"),
+)
+_LENGTHS = ("margin_px", "lane_least_px2", "pole_least_px2", "pole_least_px", "horizon_slack_px")
 
 
 def masks_from_probabilities(
@@ -95,7 +146,7 @@ def masks_from_probabilities(
 
     Returns:
         Masks that share no pixel. Their probabilities are the CRF's marginals where it took part and was
-        heeded, and the network's own elsewhere.
+        heeded, and the network's own elsewhere; each is that of a class against all others.
 
     Raises:
         InputError: Shapes do not fit, or a probability is not finite or outside 0..1.
@@ -104,30 +155,22 @@ def masks_from_probabilities(
     height, width = probabilities.shape[1:]
     scale_x, scale_y = scale or (width / pixels.shape[1], height / pixels.shape[0])
     # Grid px per px of the reference width, along each axis.
-    unit_x, unit_y = width / REFERENCE_WIDTH_PX, scale_y * pixels.shape[1] / REFERENCE_WIDTH_PX
-    lane_seen, pole_seen = probabilities[labels.LANE], probabilities[labels.POLE]
-    lane_probability, pole_probability = lane_seen, pole_seen
-    restored = np.zeros((height, width), dtype=np.bool_)
-    if parameters.crf is not None:
-        lane_probability, pole_probability = _refined(
-            lane_seen, pole_seen, pixels, parameters, (unit_x, unit_y)
-        )
-        restored = _deleted_components(
-            pole_seen >= parameters.pole_threshold,
-            pole_probability >= parameters.pole_threshold,
-            parameters.pole_keep,
-        )
-        lane_probability = np.where(restored, lane_seen, lane_probability)
-        pole_probability = np.where(restored, pole_seen, pole_probability)
-    pole = pole_probability >= parameters.pole_threshold
-    lane = (lane_probability >= parameters.lane_threshold) & ~pole
+    unit = width / REFERENCE_WIDTH_PX, scale_y * pixels.shape[1] / REFERENCE_WIDTH_PX
+    crf = parameters.crf or MaskCrf(None, None)
+    small = _reduced(pixels, (width, height)) if crf.lane or crf.pole else pixels
+    pole_seen, lane_seen = probabilities[labels.POLE], probabilities[labels.LANE]
+    pole_probability, pole = _told(pole_seen, parameters.pole_threshold, small, crf.pole, parameters, unit)
+    if crf.pole is not None:
+        restored = _deleted_poles(pole_seen, pole, parameters)
+        pole_probability, pole = np.where(restored, pole_seen, pole_probability), pole | restored
+    lane_probability, lane = _told(lane_seen, parameters.lane_threshold, small, crf.lane, parameters, unit)
+    lane &= ~pole
     if horizon is not None:
         slack = parameters.horizon_slack_px * pixels.shape[1] / REFERENCE_WIDTH_PX
         lane &= _ground_side(horizon, slack, (height, width), (scale_x, scale_y))
-    least = unit_x * unit_y
     return Masks(
-        lane=_without_specks(lane, parameters.lane_least_px2 * least),
-        pole=_without_specks(pole, parameters.pole_least_px2 * least),
+        lane=_lane_pieces(lane, probabilities, parameters, unit),
+        pole=_pole_pieces(pole, probabilities, parameters, unit),
         lane_probability=np.ascontiguousarray(lane_probability),
         pole_probability=np.ascontiguousarray(pole_probability),
         scale_x=scale_x,
@@ -147,25 +190,31 @@ _SUREST = 1e-4
 """Least probability the CRF is told: a class the network gives nothing can still be won by 9 nats."""
 
 
-def _refined(
-    lane: Floats32,
-    pole: Floats32,
-    pixels: NDArray[np.uint8],
+def _reduced(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """The image on a grid of (width, height) cells."""
+    shrinks = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return np.asarray(small, dtype=np.uint8)
+
+
+def _told(
+    seen: Floats32,
+    threshold: float,
+    small: NDArray[np.uint8],
+    crf: ClassCrf | None,
     parameters: MaskParameters,
     unit: tuple[float, float],
-) -> tuple[Floats32, Floats32]:
-    """Marginals of lane and pole (h,w) by the CRF over lane, pole and the rest."""
-    if parameters.crf is None:
-        return lane, pole
-    height, width = lane.shape
-    crf = _on_grid(parameters.crf, unit)
-    shrinks = width <= pixels.shape[1] and height <= pixels.shape[0]
-    small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    stack = np.stack([lane, pole, 1.0 - lane - pole])
-    region = _surroundings(np.maximum(lane, pole) >= parameters.evidence, crf, parameters.reach_sigmas)
-    unary = -np.log(np.clip(stack, _SUREST, 1.0))
-    marginals = mean_field(unary, np.asarray(small, dtype=np.uint8), crf, region)
-    return np.where(region, marginals[0], lane), np.where(region, marginals[1], pole)
+) -> tuple[Floats32, Bools]:
+    """Probability of one class and its mask (h,w): by its CRF, or as seen."""
+    if crf is None:
+        return seen, seen >= threshold
+    window = np.ones([2 * round(parameters.margin_px * each) + 1 for each in unit[::-1]], dtype=np.uint8)
+    evidence = (seen >= parameters.evidence).astype(np.uint8)
+    region = np.asarray(cv2.dilate(evidence, window)).astype(np.bool_)
+    stack = np.clip(np.stack([seen, 1.0 - seen]), _SUREST, 1.0)
+    marginals = mean_field(-np.log(stack), small, _on_grid(crf.crf, unit), region)
+    refined = np.where(region, marginals[0], seen)
+    return refined, region & (refined >= crf.threshold)
 
 
 def _on_grid(crf: CrfParameters, unit: tuple[float, float]) -> CrfParameters:
@@ -184,37 +233,41 @@ def _scaled(kernel: _K, unit: tuple[float, float]) -> _K:
     )
 
 
-def _surroundings(evidence: Bools, crf: CrfParameters, sigmas: float) -> Bools:
-    """All pixels within ``sigmas`` widths of the wider kernel around the evidence."""
-    kernels = [kernel for kernel in (crf.smoothness, crf.appearance) if kernel is not None]
-    reach_x = int(np.ceil(sigmas * max((kernel.sigma_x_px for kernel in kernels), default=0.0)))
-    reach_y = int(np.ceil(sigmas * max((kernel.sigma_y_px for kernel in kernels), default=0.0)))
-    window = np.ones((2 * reach_y + 1, 2 * reach_x + 1), dtype=np.uint8)
-    return np.asarray(cv2.dilate(evidence.astype(np.uint8), window)).astype(np.bool_)
+def _deleted_poles(seen: Floats32, left: Bools, parameters: MaskParameters) -> Bools:
+    """The sure poles of the network of which the mask ``left`` keeps too little."""
+    pieces = pieces_of(seen >= parameters.pole_threshold)
+    sure = pieces.peaks(seen) >= parameters.pole_sure
+    return pieces.where(sure & (pieces.share(left) < parameters.pole_keep))
 
 
-def _deleted_components(seen: Bools, left: Bools, keep: float) -> Bools:
-    """The connected pieces of ``seen`` of which less than the share ``keep`` is in ``left``."""
-    count, pieces = _pieces(seen)
-    size = np.bincount(pieces.ravel(), minlength=count)
-    kept = np.bincount(pieces[left], minlength=count)
-    deleted = kept < keep * size
-    deleted[0] = False
-    return np.asarray(deleted[pieces], dtype=np.bool_)
+def _pole_pieces(
+    mask: Bools, probabilities: Floats32, parameters: MaskParameters, unit: tuple[float, float]
+) -> Bools:
+    pieces = pieces_of(mask)
+    length = np.hypot(*(pieces.boxes / unit).T)
+    return pieces.where(
+        (pieces.sizes >= parameters.pole_least_px2 * unit[0] * unit[1])
+        & (length >= parameters.pole_least_px)
+        & (pieces.peaks(probabilities[labels.POLE]) >= parameters.pole_peak)
+    )
 
 
-def _without_specks(mask: Bools, least: float) -> Bools:
-    """The connected pieces (8 neighbours) of at least ``least`` px."""
-    count, pieces = _pieces(mask)
-    large = np.bincount(pieces.ravel(), minlength=count) >= least
-    large[0] = False
-    return np.asarray(large[pieces], dtype=np.bool_)
+_BORDER_PX = 4.0
+"""px of the reference width; what lies so near to paint is its border, half a lane stroke away at 15 m."""
 
 
-def _pieces(mask: Bools) -> tuple[int, NDArray[np.int32]]:
-    """Number of labels and their image, int32 (h,w); label 0 is outside the mask."""
-    count, pieces = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    return count, np.asarray(pieces, dtype=np.int32)
+def _lane_pieces(
+    mask: Bools, probabilities: Floats32, parameters: MaskParameters, unit: tuple[float, float]
+) -> Bools:
+    pieces = pieces_of(mask)
+    reach = max(1, round(_BORDER_PX * unit[0])), max(1, round(_BORDER_PX * unit[1]))
+    road = pieces.around(probabilities[labels.ROAD], reach)
+    return pieces.where(
+        (pieces.sizes >= parameters.lane_least_px2 * unit[0] * unit[1])
+        & (pieces.peaks(probabilities[labels.LANE]) >= parameters.lane_peak)
+        # Paint that fills the image has no border that could be road.
+        & ~(road < parameters.lane_road)
+    )
 
 
 def _ground_side(

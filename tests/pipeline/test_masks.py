@@ -8,7 +8,14 @@ import pytest
 from pipeline import labels
 from pipeline.crf import AppearanceKernel, CrfParameters, SmoothnessKernel
 from pipeline.errors import InputError, RigError
-from pipeline.masks import REFERENCE_WIDTH_PX, MaskParameters, horizon_line, masks_from_probabilities
+from pipeline.masks import (
+    REFERENCE_WIDTH_PX,
+    ClassCrf,
+    MaskCrf,
+    MaskParameters,
+    horizon_line,
+    masks_from_probabilities,
+)
 from pipeline.records import CameraModel
 
 ROOT = Path(__file__).parents[2]
@@ -18,8 +25,9 @@ RECORDED = (
 THIN_POLES = sorted(RECORDED.glob("0[2345]_*.npz"))
 
 PLAIN = MaskParameters(crf=None)
-HARD = CrfParameters(SmoothnessKernel(3.0, 3.0, 3.0), AppearanceKernel(80.0, 80.0, (13.0,) * 3, 10.0))
+PUBLISHED = CrfParameters(SmoothnessKernel(3.0, 3.0, 3.0), AppearanceKernel(80.0, 80.0, (13.0,) * 3, 10.0))
 """The setting of the published examples, made for large objects."""
+HARD = MaskCrf(ClassCrf(PUBLISHED, 0.5), ClassCrf(PUBLISHED, 0.3))
 
 
 def probabilities_of(label, sure=0.9):
@@ -79,10 +87,12 @@ class TestThinPoles:
         fat = np.where(
             cv2.dilate((label == labels.POLE).astype(np.uint8), np.ones((1, 5), np.uint8)), labels.POLE, label
         )
-        stack = probabilities_of(fat, 0.6)
+        spill = (label != labels.POLE) & (fat == labels.POLE)
+        stack = probabilities_of(label)
+        stack[labels.POLE, spill] = 0.35
+        stack[labels.ROAD, spill] = 0.55
         masks = masks_from_probabilities(stack, image, MaskParameters())
         plain = masks_from_probabilities(stack, image, PLAIN)
-        spill = (label != labels.POLE) & (fat == labels.POLE)
         assert kept(plain.pole, spill) == 1.0
         assert kept(masks.pole, spill) < 0.2
         assert kept(masks.pole, label == labels.POLE) > 0.95
@@ -97,7 +107,7 @@ class TestThinPoles:
         stack = np.zeros((len(labels.NAMES), *pole.shape), np.float32)
         stack[labels.POLE] = pole
         stack[labels.OTHER] = 1.0 - pole
-        masks = masks_from_probabilities(stack, image, MaskParameters(pole_least_px2=0.0))
+        masks = masks_from_probabilities(stack, image, MaskParameters(pole_least_px2=0.0, pole_least_px=0.0))
         # The scene's pole is the largest piece that the unary shows.
         count, pieces = cv2.connectedComponents((pole >= 0.5).astype(np.uint8))
         largest = max(range(1, count), key=lambda piece: int((pieces == piece).sum()))
@@ -140,7 +150,7 @@ class TestThresholdsAndSizes:
         image = np.full((40, 60, 3), 100, np.uint8)
         assert not masks_from_probabilities(stack, image, PLAIN).lane.any()
         assert masks_from_probabilities(
-            stack, image, MaskParameters(crf=None, lane_threshold=0.44)
+            stack, image, MaskParameters(crf=None, lane_threshold=0.44, lane_peak=0.44)
         ).lane.all()
 
     def test_specks_go_and_pieces_stay(self):
@@ -176,7 +186,9 @@ class TestThresholdsAndSizes:
     def test_masks_share_no_pixel(self):
         stack = np.zeros((len(labels.NAMES), 30, 30), np.float32)
         stack[labels.LANE] = stack[labels.POLE] = 0.5
-        masks = masks_from_probabilities(stack, np.zeros((30, 30, 3), np.uint8), PLAIN)
+        masks = masks_from_probabilities(
+            stack, np.zeros((30, 30, 3), np.uint8), MaskParameters(crf=None, lane_peak=0.0)
+        )
         assert masks.pole.all()
         assert not masks.lane.any()
 
@@ -198,6 +210,61 @@ class TestThresholdsAndSizes:
         stack = probabilities_of(label)
         masks = masks_from_probabilities(stack, image, MaskParameters())
         np.testing.assert_array_equal(masks.pole_probability[:, :100], stack[labels.POLE][:, :100])
+
+
+class TestPieces:
+    """Which pieces stay, without a CRF: each rule beside a piece that just passes it."""
+
+    @staticmethod
+    def two_poles(**second):
+        """Two poles of 4x60 px, all sure but for the keywords' probability of the second one."""
+        label = np.full((100, REFERENCE_WIDTH_PX), labels.VEGETATION)
+        label[20:80, 300:304] = labels.POLE
+        label[20:80, 600:604] = labels.POLE
+        stack = probabilities_of(label)
+        for value in second.values():
+            stack[labels.POLE, 20:80, 600:604] = value
+        image = np.zeros((*label.shape, 3), np.uint8)
+        return masks_from_probabilities(stack, image, PLAIN).pole[50, [300, 600]].tolist()
+
+    def test_a_pole_has_a_cell_that_is_likely_one(self):
+        assert self.two_poles(p=0.41) == [True, True]
+        assert self.two_poles(p=0.39) == [True, False]
+
+    def test_a_pole_has_a_length_along_any_direction(self):
+        label = np.full((200, REFERENCE_WIDTH_PX), labels.VEGETATION)
+        label[20:35, 300:306] = labels.POLE
+        label[120:126, 300:315] = labels.POLE
+        label[20:30, 600:605] = labels.POLE
+        image = np.zeros((*label.shape, 3), np.uint8)
+        pole = masks_from_probabilities(probabilities_of(label), image, PLAIN).pole
+        assert pole[22, 302]
+        assert pole[122, 302]
+        assert not pole[22, 602]
+
+    @pytest.mark.parametrize(("ground", "stays"), [(labels.ROAD, True), (labels.VEGETATION, False)])
+    def test_paint_lies_on_a_road(self, ground, stays):
+        label = np.full((100, REFERENCE_WIDTH_PX), labels.VEGETATION)
+        label[20:80, 100:300] = ground
+        label[30:70, 190:200] = labels.LANE
+        image = np.zeros((*label.shape, 3), np.uint8)
+        assert masks_from_probabilities(probabilities_of(label), image, PLAIN).lane[50, 195] == stays
+
+    def test_paint_at_the_road_s_edge_stays(self):
+        label = np.full((100, REFERENCE_WIDTH_PX), labels.VEGETATION)
+        label[:, 400:] = labels.ROAD
+        label[10:90, 392:400] = labels.LANE
+        image = np.zeros((*label.shape, 3), np.uint8)
+        assert masks_from_probabilities(probabilities_of(label), image, PLAIN).lane[50, 395]
+
+    def test_paint_has_a_cell_that_is_likely_paint(self):
+        label = np.full((100, REFERENCE_WIDTH_PX), labels.ROAD)
+        label[30:70, 190:200] = labels.LANE
+        image = np.zeros((*label.shape, 3), np.uint8)
+        for sure, stays in ((0.61, True), (0.59, False)):
+            stack = probabilities_of(label)
+            stack[labels.LANE, label == labels.LANE] = sure
+            assert masks_from_probabilities(stack, image, PLAIN).lane.any() == stays
 
 
 class TestHorizon:
@@ -231,7 +298,7 @@ class TestHorizon:
     def test_a_slanted_horizon_on_a_coarse_grid(self, scale):
         shape = (int(80 * scale[1]), int(120 * scale[0]))
         line = np.array([-1.0, 1.0, 0.3])
-        parameters = MaskParameters(crf=None, horizon_slack_px=0.0, lane_least_px2=0.0)
+        parameters = MaskParameters(crf=None, horizon_slack_px=0.0, lane_least_px2=0.0, lane_road=0.0)
         stack = probabilities_of(np.full(shape, labels.LANE))
         masks = masks_from_probabilities(stack, np.zeros((80, 120, 3), np.uint8), parameters, line)
         for row, column in np.ndindex(shape):
@@ -242,7 +309,7 @@ class TestHorizon:
         label = np.full((100, REFERENCE_WIDTH_PX * 2), labels.LANE)
         image = np.zeros((*label.shape, 3), np.uint8)
         line = np.array([0.0, 3.0, -3.0 * 70.0])
-        parameters = MaskParameters(crf=None, horizon_slack_px=10.0)
+        parameters = MaskParameters(crf=None, horizon_slack_px=10.0, lane_road=0.0)
         masks = masks_from_probabilities(probabilities_of(label), image, parameters, line)
         assert np.flatnonzero(masks.lane.any(axis=1))[0] == 50
 
@@ -286,5 +353,7 @@ class TestRefusals:
     def test_parameters(self):
         with pytest.raises(RigError, match="lane_threshold"):
             MaskParameters(lane_threshold=1.5)
-        with pytest.raises(RigError, match="reach_sigmas"):
-            MaskParameters(reach_sigmas=np.nan)
+        with pytest.raises(RigError, match="margin_px"):
+            MaskParameters(margin_px=np.nan)
+        with pytest.raises(RigError, match="after the CRF"):
+            ClassCrf(PUBLISHED, 1.5)

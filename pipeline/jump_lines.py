@@ -1,0 +1,324 @@
+"""Straight edges of bodies where the range jumps: along a ring from beam to beam, and from ring to ring.
+
+The true edge lies somewhere between the last beam on the body and the first beside it. It is taken in the
+middle; the error is uniform over that gap, and because the beams of a spinning sensor often form columns,
+much of it is common to a whole line: it is not averaged over the rings but enters the covariance at both
+ends.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.plane_edges import MIN_LENGTH_M, MIN_LENGTH_RAD
+from pipeline.records import Floats
+from pipeline.rings import ScanPattern
+from pipeline.uncertain_lines import UncertainLine, across, ends_covariance
+
+JUMP_M, JUMP_SHARE = 0.5, 0.06
+"""m and share of the range; the least jump along a ring: the depth of a parked car's flank, and what noise
+and slant make of ranges far away."""
+JUMP_UP_M, JUMP_UP_SHARE = 1.0, 0.10
+"""The same between rings, which lie further apart on a slanted surface."""
+GAP_STEPS = 2.6
+"""A gap along a ring of more steps breaks it: what lies there was not seen."""
+SPARSEST_RAD = math.radians(0.8)
+"""rad; between rings further apart an edge is known to worse than 3 px (10 px over sqrt 12 at f = 720 px)."""
+BEAM_RAD = 0.002
+"""rad; width of a beam (2 to 3 mrad on data sheets): a beam that grazes a body still returns from it."""
+COMMON_DEPTH_M = 0.03
+"""m; accuracy of ranges on data sheets, common to all points of a line."""
+STEP_M, STEP_SHARE = 0.3, 0.02
+"""m and share of the range by which neighbouring points of one edge differ in range."""
+LEAN = 1.0
+"""Slope (45 deg) up to which an edge leans from ring to ring, and an edge along a ring rises."""
+MIN_RINGS = 5
+"""Points of an edge across rings, at least: two directions and a bend are 4."""
+MIN_COLUMNS = 8
+"""Points of an edge along a ring, at least."""
+MOST_EDGES = 8000
+"""Edge points of either kind, the nearest first, that are looked at: a street has 2000. Bounds the time."""
+HALF_COMMON = 0.5
+"""Correlation of the errors of both ends from the gaps: 1 where beams form columns and the edge is parallel
+to them, 0 where it crosses many."""
+_DEPTH_RMS_M = 0.15
+"""m; points of an edge scatter less in depth: three times range noise, and the roundness of a body."""
+_ECHO_RAD = 1e-6
+"""rad; points nearer along a ring are echoes of one beam."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _EdgePoints:
+    """Points (M) where the range jumps.
+
+    Attributes:
+        at: Index of the nearer point in the scan pattern.
+        position: (M,3), m, in the middle of the gap at the range of the nearer point.
+        ring: Rank of the ring.
+        azimuth: rad, of the scan pattern.
+        elevation: rad.
+        distance: m.
+        side: 1 or -1, on which side the range grows.
+        gap: rad, from the nearer point's beam to the other.
+    """
+
+    at: NDArray[np.int64]
+    position: Floats
+    ring: NDArray[np.int64]
+    azimuth: Floats
+    elevation: Floats
+    distance: Floats
+    side: NDArray[np.int64]
+    gap: Floats
+
+
+def jump_lines(xyz: Floats, pattern: ScanPattern) -> list[UncertainLine]:
+    """Straight edges across the rings and along them.
+
+    Args:
+        xyz: float64 (N,3), m; the sensor stands at the origin and spins about z.
+        pattern: Its scan pattern.
+    """
+    upright = _along_rings(xyz, pattern)
+    lines = _lines(pattern, upright, _linked_across(upright, pattern), MIN_RINGS)
+    if pattern.ring_spacing <= SPARSEST_RAD:
+        level = _between_rings(xyz, pattern)
+        lines += _lines(pattern, level, _linked_along(level, pattern), MIN_COLUMNS)
+    return lines
+
+
+def _goes_on(near: Floats, far: Floats, before: Floats, ratio: Floats) -> Floats:
+    """Range (M,) that a plane through the nearer point and the one before it has at the far beam.
+
+    Along equal steps of angle the inverse range of a plane is linear, but for terms of second order.
+    """
+    inverse = 1.0 / near + np.minimum(1.0 / near - 1.0 / before, 0.0) * ratio
+    # A plane that runs out of sight before the far beam may be what that beam sees.
+    return np.where(inverse > 1.0 / far, 1.0 / np.maximum(inverse, 1.0 / far), far)
+
+
+def _along_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
+    """Jumps between neighbours on a ring, at the azimuth between them."""
+    r, azimuth = pattern.distance, pattern.azimuth
+    gap = np.diff(azimuth)
+    beside = (np.diff(pattern.ring) == 0) & (gap > _ECHO_RAD) & (gap < GAP_STEPS * pattern.azimuth_step)
+    nearest = np.minimum(r[:-1], r[1:])
+    least = np.maximum(JUMP_M, JUMP_SHARE * nearest)
+    edge = np.flatnonzero(beside & (np.abs(np.diff(r)) > least))
+    side = np.where(r[edge + 1] > r[edge], 1, -1)
+    near, far = np.where(side > 0, edge, edge + 1), np.where(side > 0, edge + 1, edge)
+    # The pair before the nearer point, if it is on the ring and near it.
+    pair = np.clip(np.where(side > 0, edge - 1, edge + 1), 0, max(len(gap) - 1, 0))
+    before = np.clip(near - side, 0, len(r) - 1)
+    known = beside[pair] & (pair != edge)
+    ratio = gap[edge] / np.maximum(gap[pair], _ECHO_RAD)
+    on = _goes_on(r[near], r[far], np.where(known, r[before], r[near]), ratio)
+    real = r[far] - on > least[edge]
+    edge, side, near = edge[real], side[real], near[real]
+    half = 0.5 * side * gap[edge]
+    x, y, z = xyz[pattern.index[near]].T
+    turned = np.column_stack([x * np.cos(half) - y * np.sin(half), x * np.sin(half) + y * np.cos(half), z])
+    return _nearest_first(
+        _EdgePoints(
+            near,
+            turned,
+            pattern.ring[near],
+            azimuth[near] + half,
+            pattern.elevation[near],
+            r[near],
+            side,
+            gap[edge],
+        )
+    )
+
+
+def _between_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
+    """Jumps between a point and the one above or below it on the next ring, at the elevation between them."""
+    parts = []
+    r = pattern.distance
+    beyond = {upward: _next_ring(pattern, upward) for upward in (1, -1)}
+    for upward in (1, -1):
+        far, before = beyond[upward], beyond[-upward]
+        near = np.flatnonzero((far >= 0) & (before >= 0))
+        far, before = far[near], before[near]
+        gap = upward * (pattern.elevation[far] - pattern.elevation[near])
+        back = upward * (pattern.elevation[near] - pattern.elevation[before])
+        fair = (gap > 0.2 * pattern.ring_spacing) & (gap < SPARSEST_RAD) & (back > 0.2 * pattern.ring_spacing)
+        near, far, before = near[fair], far[fair], before[fair]
+        gap, back = gap[fair], back[fair]
+        on = _goes_on(r[near], r[far], r[before], gap / back)
+        edge = r[far] - on > np.maximum(JUMP_UP_M, JUMP_UP_SHARE * r[near])
+        near, gap = near[edge], gap[edge]
+        elevation = pattern.elevation[near] + 0.5 * upward * gap
+        x, y = xyz[pattern.index[near], :2].T
+        around = np.arctan2(y, x)
+        position = r[near, None] * np.column_stack(
+            [np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), np.sin(elevation)]
+        )
+        side = np.full(len(near), upward)
+        parts.append(
+            _EdgePoints(
+                near, position, pattern.ring[near], pattern.azimuth[near], elevation, r[near], side, gap
+            )
+        )
+    joined = _EdgePoints(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in _EdgePoints.__slots__)
+    )
+    return _nearest_first(joined)
+
+
+def _nearest_first(edges: _EdgePoints) -> _EdgePoints:
+    """At most ``MOST_EDGES`` of the points, the nearest."""
+    if len(edges.at) <= MOST_EDGES:
+        return edges
+    return _taken(edges, np.sort(np.argsort(edges.distance, kind="stable")[:MOST_EDGES]))
+
+
+def _taken(edges: _EdgePoints, index: NDArray[np.int64]) -> _EdgePoints:
+    return _EdgePoints(*(getattr(edges, name)[index] for name in _EdgePoints.__slots__))
+
+
+_KEY_TURN = 4.0 * math.pi
+"""More than a turn, so that rings do not touch in a common key."""
+
+
+def _next_ring(pattern: ScanPattern, upward: int) -> NDArray[np.int64]:
+    """For each point the one beside it on the next ring up or down, -1 for none."""
+    key = pattern.ring * _KEY_TURN + pattern.azimuth
+    wanted = key + upward * _KEY_TURN
+    right = np.clip(np.searchsorted(key, wanted), 1, len(key) - 1)
+    partner = np.where(wanted - key[right - 1] < key[right] - wanted, right - 1, right)
+    return np.where(np.abs(key[partner] - wanted) < 0.6 * pattern.azimuth_step, partner, -1)
+
+
+def _linked_across(edges: _EdgePoints, pattern: ScanPattern) -> NDArray[np.int64]:
+    """Pairs (2,P) of points of one edge on neighbouring rings, or with one ring between them."""
+    pairs = []
+    for side in (1, -1):
+        own = np.flatnonzero(edges.side == side)
+        own = own[np.lexsort((edges.azimuth[own], edges.ring[own]))]
+        for skip in (1, 2):
+            partner = _partners(edges, own, skip, 0.0)
+            off = np.abs(edges.azimuth[partner] - edges.azimuth[own])
+            # Some lasers sit further apart than the median.
+            rise = np.maximum(
+                skip * pattern.ring_spacing, np.abs(edges.elevation[partner] - edges.elevation[own])
+            )
+            near = off <= LEAN * rise + 1.5 * pattern.azimuth_step
+            pairs.append(_level(edges, own[near], partner[near], skip))
+    return np.concatenate(pairs, axis=1)
+
+
+def _linked_along(edges: _EdgePoints, pattern: ScanPattern) -> NDArray[np.int64]:
+    """Pairs (2,P) of points of one edge in neighbouring columns, on one ring or on neighbouring ones."""
+    pairs = []
+    step = pattern.azimuth_step
+    for side in (1, -1):
+        own = np.flatnonzero(edges.side == side)
+        own = own[np.lexsort((edges.azimuth[own], edges.ring[own]))]
+        for climb in (-1, 0, 1):
+            partner = _partners(edges, own, climb, step)
+            ahead = edges.azimuth[partner] - edges.azimuth[own]
+            near = (ahead > 0.3 * step) & (ahead < GAP_STEPS * step)
+            pairs.append(_level(edges, own[near], partner[near], climb))
+    return np.concatenate(pairs, axis=1)
+
+
+def _partners(edges: _EdgePoints, own: NDArray[np.int64], climb: int, ahead: float) -> NDArray[np.int64]:
+    """For each of ``own`` (sorted by ring and azimuth) that one ``climb`` rings up nearest to its azimuth."""
+    if len(own) == 0:
+        return own
+    key = edges.ring[own] * _KEY_TURN + edges.azimuth[own]
+    wanted = key + climb * _KEY_TURN + ahead
+    right = np.clip(np.searchsorted(key, wanted), 1, max(len(key) - 1, 1)) % len(key)
+    return own[np.where(wanted - key[right - 1] < key[right] - wanted, right - 1, right)]
+
+
+def _level(edges: _EdgePoints, a: NDArray[np.int64], b: NDArray[np.int64], climb: int) -> NDArray[np.int64]:
+    """Those pairs (2,P) that differ in range by no more than one edge does, and lie where they should."""
+    step = np.abs(edges.distance[a] - edges.distance[b])
+    fits = (step <= STEP_M + STEP_SHARE * edges.distance[a]) & (edges.ring[b] - edges.ring[a] == climb)
+    return np.stack([a[fits], b[fits]])
+
+
+def _lines(
+    pattern: ScanPattern, edges: _EdgePoints, pairs: NDArray[np.int64], least: int
+) -> list[UncertainLine]:
+    """Straight lines of the connected groups of edge points."""
+    count = len(edges.at)
+    graph = coo_array((np.ones(pairs.shape[1], dtype=np.int8), (pairs[0], pairs[1])), shape=(count, count))
+    label = connected_components(graph, directed=False)[1]
+    order = np.argsort(label, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if count else []
+    lines = []
+    for group in groups:
+        parts = _straight_parts(edges, group, least, pattern.azimuth_step)
+        lines += [line for part in parts if (line := _line(edges, part, pattern)) is not None]
+    return lines
+
+
+def _straight_parts(
+    edges: _EdgePoints, group: NDArray[np.int64], least: int, step: float
+) -> list[NDArray[np.int64]]:
+    """A chain of edge points split where it bends more than its gaps allow."""
+    waiting, parts = [group], []
+    while waiting:
+        chain = waiting.pop()
+        if len(chain) < least:
+            continue
+        mean, direction, along = _axis(edges.position[chain])
+        sideways, depth = ((edges.position[chain] - mean) @ across(direction, mean).T).T
+        allowed = edges.distance[chain] * (0.75 * np.maximum(edges.gap[chain], step) + BEAM_RAD)
+        excess = np.maximum(np.abs(sideways) / allowed, np.abs(depth) / (3.0 * _DEPTH_RMS_M))
+        if excess.max() <= 1.0:
+            parts.append(chain)
+            continue
+        order = np.argsort(along)
+        # Cut where the chain is farthest from the line from its first point to its last.
+        first, last = edges.position[chain[order[0]]], edges.position[chain[order[-1]]]
+        chord = (last - first) / max(float(np.linalg.norm(last - first)), 1e-9)
+        off = edges.position[chain[order]] - first
+        off = np.linalg.norm(off - (off @ chord)[:, None] * chord, axis=1)
+        cut = int(np.clip(off.argmax(), 1, len(chain) - 1))
+        waiting += [chain[order[:cut]], chain[order[cut:]]]
+    return parts
+
+
+def _axis(points: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean (3,), direction (3,) and positions (M,) along the line of least squares through points (M,3)."""
+    mean = points.mean(axis=0)
+    centred = points - mean
+    direction = np.asarray(np.linalg.eigh(centred.T @ centred)[1][:, 2])
+    return mean, direction, np.asarray(centred @ direction)
+
+
+def _line(edges: _EdgePoints, part: NDArray[np.int64], pattern: ScanPattern) -> UncertainLine | None:
+    """The line through a straight part, or None where it is too short or ragged."""
+    points = edges.position[part]
+    mean, direction, along = _axis(points)
+    low, high = float(along.min()), float(along.max())
+    distance = float(edges.distance[part].mean())
+    if high - low < max(MIN_LENGTH_M, MIN_LENGTH_RAD * distance):
+        return None
+    sideways, depth = ((points - mean) @ across(direction, mean).T).T
+    freedom = max(len(part) - 2, 1)
+    rms = np.sqrt(np.array([sideways @ sideways, depth @ depth]) / freedom)
+    if rms[1] > _DEPTH_RMS_M:
+        return None
+    ends = (low, high)
+    gap = distance * math.hypot(float(np.sqrt((edges.gap[part] ** 2).mean())), BEAM_RAD)
+    common = gap**2 / 12.0 * np.array([[1.0, HALF_COMMON], [HALF_COMMON, 1.0]])
+    covariance = np.zeros((4, 4))
+    covariance[::2, ::2] = ends_covariance(along, ends, float(rms[0])) + common
+    covariance[1::2, 1::2] = ends_covariance(along, ends, float(rms[1])) + COMMON_DEPTH_M**2
+    return UncertainLine(
+        "jump",
+        mean + low * direction,
+        mean + high * direction,
+        np.sort(pattern.index[edges.at[part]]),
+        covariance,
+    )

@@ -98,7 +98,7 @@ class MaskParameters:
     pole_threshold: float = 0.3
     crf: MaskCrf | None = field(default_factory=_default_crf)
     evidence: float = 0.05
-    margin_px: float = 3.0
+    margin_px: float = 2.0
     pole_sure: float = 0.5
     pole_keep: float = 0.5
     lane_peak: float = 0.6

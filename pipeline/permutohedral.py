@@ -26,18 +26,22 @@ class Lattice:
     Attributes:
         shares: Sparse float32 (N,M): share of each point at each of the M corners that any point touches;
             d + 1 a point, rows sum to one.
-        steps: One sparse float32 (M,M) per direction of the lattice: half of oneself, a quarter of the
-            corner at each side.
+        beside: int32 (d+1,2,M): each corner's neighbours along each direction, M where there is none.
     """
 
     shares: csr_array
-    steps: tuple[csr_array, ...]
+    beside: NDArray[np.int32]
 
     def blurred(self, held: Floats32) -> Floats32:
-        """The blur over the corners: float32 (M,) -> (M,)."""
-        for step in self.steps:
-            held = step @ held
-        return held
+        """Half of oneself, a quarter of each neighbour, along all directions: float32 (M,) -> (M,)."""
+        padded = np.append(held, np.float32(0.0))
+        for ahead, behind in self.beside:
+            near = padded[ahead]
+            near += padded[behind]
+            near *= np.float32(0.25)
+            padded[:-1] *= np.float32(0.5)
+            padded[:-1] += near
+        return padded[:-1]
 
 
 def lattice(features: Floats32) -> Lattice:
@@ -60,7 +64,7 @@ def lattice(features: Floats32) -> Lattice:
         (shares.ravel(), place, np.arange(0, len(place) + 1, corners, dtype=np.int32)),
         shape=(len(keys), len(vertices)),
     )
-    return Lattice(matrix, tuple(_blur_steps(vertices, strides)))
+    return Lattice(matrix, _neighbours(vertices, strides))
 
 
 _CHUNK = 16384
@@ -144,7 +148,7 @@ def _numbered(keys: Ints64) -> tuple[Ints64, NDArray[np.int32]]:
     The few whose bucket was taken by another key are their own stand-ins, and only the stand-ins are sorted.
     """
     bits = min(22, max(8, len(keys).bit_length() + 1))
-    bucket = (keys * _HASH_FACTOR).view(np.uint64) >> np.uint64(64 - bits)
+    bucket = _bucket(keys, bits)
     own = np.arange(len(keys), dtype=np.int32)
     taken = np.empty(1 << bits, dtype=np.int32)
     taken[bucket] = own
@@ -179,33 +183,47 @@ def _strides(embedding: Floats32, features: Floats32) -> Ints64:
     return np.array(strides, dtype=np.int64)
 
 
-def _blur_steps(vertices: Ints64, strides: Ints64) -> list[csr_array]:
-    """One matrix (M,M) per lattice direction: half of oneself, a quarter of the vertex at each side."""
+def _neighbours(vertices: Ints64, strides: Ints64) -> NDArray[np.int32]:
+    """Number of each vertex's neighbours along each direction, int32 (d+1,2,M), M where there is none."""
     d, count = len(strides), len(vertices)
-    remainder = vertices % (d + 1)
     # One step adds 1 to every coordinate and takes d+1 from one of them; remainder d carries into every
     # coordinate.
-    plus_one = np.where(remainder == d, (d + 1) * int(strides.sum()) - d, 1)
-    steps = []
-    for stride in [*strides.tolist(), 0]:
-        wanted = vertices + plus_one - (d + 1) * stride
-        there = np.minimum(np.searchsorted(vertices, wanted), count - 1)
-        found = vertices[there] == wanted
-        steps.append(_blur_matrix(there, found))
-    return steps
-
-
-def _blur_matrix(there: Ints64, found: NDArray[np.bool_]) -> csr_array:
-    """I/2 + S/4 + S^T/4, where S takes vertex i from vertex ``there[i]`` if ``found[i]``."""
-    count = len(there)
+    plus_one = np.where(vertices % (d + 1) == d, (d + 1) * int(strides.sum()) - d, 1) + vertices
     own = np.arange(count, dtype=np.int32)
-    columns = np.repeat(own[:, None], 3, axis=1)
-    values = np.zeros((count, 3), dtype=np.float32)
-    values[:, 0] = 0.5
-    columns[:, 1] = there
-    values[:, 1] = np.float32(0.25) * found
-    ahead = there[found]
-    columns[ahead, 2] = own[found]
-    values[ahead, 2] = 0.25
-    ends = np.arange(0, 3 * count + 1, 3, dtype=np.int32)
-    return csr_array((values.ravel(), columns.ravel(), ends), shape=(count, count))
+    number = _Numbers(vertices)
+    beside = np.full((d + 1, 2, count + 1), count, dtype=np.int32)
+    for (ahead, behind), stride in zip(beside, [*strides.tolist(), 0], strict=True):
+        ahead[:-1] = number.of(plus_one - (d + 1) * stride)
+        behind[ahead[:-1]] = own
+    return beside[:, :, :-1]
+
+
+class _Numbers:
+    """Places of keys in a sorted array without repetition."""
+
+    def __init__(self, keys: Ints64) -> None:
+        self._keys = np.append(keys, np.iinfo(np.int64).max)
+        self._bits = len(keys).bit_length() + 2
+        self._taken = np.full(1 << self._bits, len(keys), dtype=np.int32)
+        bucket = _bucket(keys, self._bits)
+        own = np.arange(len(keys), dtype=np.int32)
+        self._taken[bucket] = own
+        # Keys that share a bucket with a later one are looked for among themselves.
+        self._hidden = own[self._taken[bucket] != own]
+
+    def of(self, wanted: Ints64) -> NDArray[np.int32]:
+        """Place of each key, or the number of all keys where it is not among them."""
+        found = self._taken[_bucket(wanted, self._bits)]
+        absent = np.flatnonzero(self._keys[found] != wanted)
+        found[absent] = len(self._keys) - 1
+        if len(self._hidden):
+            place = self._hidden[
+                np.minimum(np.searchsorted(self._keys[self._hidden], wanted[absent]), len(self._hidden) - 1)
+            ]
+            here = self._keys[place] == wanted[absent]
+            found[absent[here]] = place[here]
+        return found
+
+
+def _bucket(keys: Ints64, bits: int) -> NDArray[np.uint64]:
+    return (keys * _HASH_FACTOR).view(np.uint64) >> np.uint64(64 - bits)

@@ -77,8 +77,9 @@ def sky(weather: Weather, textures: Textures, direction: F32, sun: Floats, overc
     )
     far = np.float32(2.2 * weather.billows) / (rise + np.float32(0.06))
     u, v = d[0] * far, d[1] * far
-    cloud = smooth(textures.rough, u, v, 0.9) + 0.45 * smooth(textures.rough, u + 9.0, v, 3.7)
-    cloud += 0.2 * smooth(textures.fine, u, v + 5.0, 9.0)
+    # So many cells that one picture sees more than one billow of the table.
+    cloud = smooth(textures.rough, u, v, 8.0) + 0.45 * smooth(textures.rough, u + 9.0, v, 19.0)
+    cloud += 0.15 * smooth(textures.fine, u, v + 5.0, 15.0)
     # Some clouds are veils, others have edges: the same noise through a flat or a steep step.
     steep = 0.4 + 2.5 * (0.5 + 0.5 * math.sin(9.0 * weather.billows))
     cover = np.clip(steep * (cloud + 3.2 * overcast - 1.3), 0.0, 1.0)

@@ -30,7 +30,7 @@ SCHEMA: Literal["calibwatch.mask-evaluation/1"] = "calibwatch.mask-evaluation/1"
 CLASSES = {"lane": labels.LANE, "pole": labels.POLE}
 
 VARIANTS = ("argmax", "thresholds", "crf")
-"""How probabilities become masks: the likeliest class; the shipped thresholds; these after the CRF."""
+"""How probabilities become masks: the likeliest class; the shipped thresholds; the CRF with its own."""
 
 SWEEP = tuple(round(0.05 * i, 2) for i in range(1, 20))
 """Thresholds that are tried without CRF."""
@@ -89,7 +89,9 @@ class SetReport(_Part):
     folder: str
     images: int
     network_ms: float = Field(description="median")
-    masks_ms: float | None = Field(description="CRF, thresholds and least sizes, median; null without CRF")
+    masks_ms: float | None = Field(
+        description="CRF, thresholds and choice of pieces, median; null without CRF"
+    )
     classes: dict[str, ClassReport]
 
 
@@ -100,8 +102,10 @@ class Evaluation(_Part):
     model_hash: str
     model_version: str
     split: str
-    lane_threshold: float
+    lane_threshold: float = Field(description="without CRF")
     pole_threshold: float
+    lane_threshold_crf: float | None = Field(description="of the CRF's marginals; null: no CRF for the class")
+    pole_threshold_crf: float | None
     longest_side: int | None = Field(description="px that images were reduced to before; null: as the watch")
     threads: int
     resamples: int
@@ -179,12 +183,15 @@ def evaluate(
     parameters = Parameters().masks
     with _opencv_threads(options.threads):
         reports = tuple(_measured(one, segmenter, parameters, options, clock, progress) for one in chosen)
+    lane, pole = (parameters.crf.lane, parameters.crf.pole) if parameters.crf else (None, None)
     return Evaluation(
         model_hash=segmenter.info.hash,
         model_version=segmenter.info.version,
         split=options.split,
         lane_threshold=parameters.lane_threshold,
         pole_threshold=parameters.pole_threshold,
+        lane_threshold_crf=lane.threshold if lane else None,
+        pole_threshold_crf=pole.threshold if pole else None,
         longest_side=options.longest_side,
         threads=options.threads,
         resamples=RESAMPLES,

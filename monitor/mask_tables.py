@@ -7,7 +7,7 @@ from monitor.mask_evaluation import Evaluation, Quality, Ratio
 from monitor.outputs import write_whole
 from pipeline.errors import CalibwatchError
 
-_WAYS = {"argmax": "likeliest class", "thresholds": "thresholds", "crf": "thresholds and CRF"}
+_WAYS = {"argmax": "likeliest class", "thresholds": "thresholds", "crf": "CRF"}
 _SAYS = {"network": "network", "crf": "with CRF"}
 
 
@@ -41,9 +41,15 @@ def write(found: Evaluation, out: Path) -> None:
 
 def _head(found: Evaluation) -> Iterator[str]:
     reduced = "" if found.longest_side is None else f", images reduced to {found.longest_side} px"
+    crf = (
+        f"{name} {threshold:g}"
+        for name, threshold in (("lane", found.lane_threshold_crf), ("pole", found.pole_threshold_crf))
+        if threshold is not None
+    )
     yield (
         f"Network {found.model_version or 'without version'} (SHA-256 {found.model_hash[:12]}), split "
-        f"{found.split}, thresholds lane {found.lane_threshold:g}, pole {found.pole_threshold:g}{reduced}. "
+        f"{found.split}, thresholds lane {found.lane_threshold:g}, pole {found.pole_threshold:g} "
+        f"(after the CRF {', '.join(crf) or 'the same'}){reduced}. "
         "Precision and recall with a slack of 2 px at 1280 px width. In brackets 95 % intervals, "
         f"{found.resamples} resamples of the images (seed {found.seed})."
     )
@@ -81,7 +87,7 @@ def _reliability(found: Evaluation) -> Iterator[str]:
 def _times(found: Evaluation) -> Iterator[str]:
     yield f"Median wall time of an image, ms; threads: {found.threads}."
     yield ""
-    yield "| set | images | network | CRF, thresholds, least sizes |"
+    yield "| set | images | network | CRF, thresholds, choice of pieces |"
     yield "|---|---|---|---|"
     for one in found.sets:
         masks = "-" if one.masks_ms is None else f"{one.masks_ms:.0f}"

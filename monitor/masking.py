@@ -54,7 +54,7 @@ class MaskedImage(BaseModel):
     pole: Covered
     network_ms: float
     masks_ms: float
-    """CRF, thresholds and least sizes."""
+    """CRF, thresholds and choice of pieces."""
     label: str
     """The label image that was written."""
     overlay: str

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline import labels
+from pipeline.label_image import label_image
+from pipeline.masks import MaskParameters, masks_from_probabilities
+from pipeline.segmentation import Segmenter, grid_scale
 from tests.oracles import onnx_bytes, plain_network
 
 
@@ -178,29 +181,25 @@ def test_nothing_is_replaced_unasked_and_an_input_never(calibwatch, network, tmp
     assert np.array_equal(labels_in(kept), drawn())
 
 
-def test_the_crf_takes_part_unless_told(calibwatch, tmp_path):
-    """Of the network that ships, on noise with a bar: with and without it the masks are the watch's own."""
-    from monitor.model_file import open_segmenter  # noqa: PLC0415 - of this test alone
-    from pipeline.label_image import label_image  # noqa: PLC0415 - likewise
-    from pipeline.masks import MaskParameters, masks_from_probabilities  # noqa: PLC0415 - likewise
-    from pipeline.segmentation import grid_scale  # noqa: PLC0415 - likewise
-
-    rng = np.random.default_rng(8)
-    pixels = cv2.GaussianBlur(rng.integers(60, 140, (121, 241, 3)).astype(np.uint8), (0, 0), 1.5)
-    pixels[60:, 118:123] = 250
-    pixels[:70, 50:53] = 20
-    pixels[:60, 53:] = pixels[:60, :50].mean() + 60
-    image = save(tmp_path / "bar.png", pixels)
-    segmenter = open_segmenter(None, 1)
+def test_the_crf_takes_part_unless_told(calibwatch, network, tmp_path):
+    """A stripe with holes, and specks: the masks are those of the watch's own functions, and differ."""
+    label = np.zeros((121, 241), np.uint8)
+    label[:, 100:120] = labels.LANE
+    holes = np.random.default_rng(4).random(label.shape) < 0.2
+    pixels = plain_network.picture(np.where(holes, 0, label))
+    image = save(tmp_path / "holes.png", pixels)
+    probabilities = Segmenter(plain_network.model()).probabilities(pixels)
+    found = {}
     for name, options, parameters in (
         ("with", (), MaskParameters()),
         ("without", ("--no-crf",), MaskParameters(crf=None)),
     ):
-        assert calibwatch("masks", image, "--out", tmp_path / name, *options)[0] == 0
-        masks = masks_from_probabilities(
-            segmenter.probabilities(pixels), pixels, parameters, scale=grid_scale(241, 121)
-        )
-        assert np.array_equal(labels_in(tmp_path / name / "bar.png"), label_image(masks, (241, 121)))
+        out = tmp_path / name
+        assert calibwatch("masks", image, "--out", out, "--model", network, *options)[0] == 0
+        masks = masks_from_probabilities(probabilities, pixels, parameters, scale=grid_scale(241, 121))
+        found[name] = labels_in(out / "holes.png")
+        assert np.array_equal(found[name], label_image(masks, (241, 121)))
+    assert not np.array_equal(found["with"], found["without"])
 
 
 @pytest.mark.parametrize(

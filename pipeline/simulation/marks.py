@@ -111,13 +111,13 @@ def _junction(p: SceneParameters, s: float, rng: np.random.Generator) -> tuple[l
         if rng.random() < 0.6:
             d, ahead = -edge + (k + 0.5) * p.lane_width, k < forward
             place = s - 12.0 if ahead else s + 16.0
-            patches_, strokes_ = _arrow(place, d, 1.0 if ahead else -1.0, rng)
+            patches_, strokes_ = lane_arrow(place, d, 1.0 if ahead else -1.0, rng)
             patches += patches_
             strokes += strokes_
     return patches, strokes
 
 
-def _arrow(s: float, d: float, way: float, rng: np.random.Generator) -> tuple[list[Patch], list[Stroke]]:
+def lane_arrow(s: float, d: float, way: float, rng: np.random.Generator) -> tuple[list[Patch], list[Stroke]]:
     """An arrow of 3 to 6 m ahead, to a side or both; ``way`` is +1 along the road, -1 against it."""
     long, shaft = float(rng.uniform(3.0, 6.0)), float(rng.uniform(0.1, 0.2))
     side = float(rng.choice([-1.0, 1.0]))
@@ -148,11 +148,11 @@ def _in_lane(p: SceneParameters, s: float, rng: np.random.Generator) -> tuple[li
     d, way = -edge + (lane + 0.5) * p.lane_width, 1.0 if lane < forward else -1.0
     kind = rng.random()
     if kind < 0.22:
-        return _arrow(s, d, way, rng)
+        return lane_arrow(s, d, way, rng)
     if kind < 0.42:
         word = _WORDS[int(rng.integers(len(_WORDS)))]
         colour = YELLOW if rng.random() < 0.2 else WHITE
-        return [], _word(word, (s, d), way, colour, rng)
+        return [], lettering(word, (s, d), way, colour, rng)
     if kind < 0.6:
         return [], _hatched(p, s, rng)
     if kind < 0.75:
@@ -170,7 +170,7 @@ def _in_lane(p: SceneParameters, s: float, rng: np.random.Generator) -> tuple[li
     return [], []
 
 
-def _word(
+def lettering(
     word: str, place: tuple[float, float], way: float, colour: int, rng: np.random.Generator
 ) -> list[Stroke]:
     """Letters stretched along the road, as wide as the lane allows."""

@@ -85,7 +85,7 @@ def street_lamp(
     for way in (inward, -inward) if kind == 1 else (inward,):
         end = top + reach * way + np.array([0.0, 0.0, rise])
         if kind == 2:
-            parts += _bent(top, way, (reach, rise + 0.6), 0.7 * radius, colour)
+            parts += bent_arm(top, way, (reach, rise + 0.6), 0.7 * radius, colour)
             end = top + reach * way + np.array([0.0, 0.0, rise + 0.6])
         elif kind != 4:
             parts.append(bar(top, end, 0.55 * radius, labels.POLE, colour, reflectance=0.35))
@@ -95,7 +95,9 @@ def street_lamp(
     return parts
 
 
-def _bent(top: Floats, way: Floats, size: tuple[float, float], radius: float, colour: Colour) -> list[Solid]:
+def bent_arm(
+    top: Floats, way: Floats, size: tuple[float, float], radius: float, colour: Colour
+) -> list[Solid]:
     """A quarter of an ellipse from the top of a mast to a lamp, in four straight pieces."""
     angle = np.linspace(0.0, math.pi / 2, 5)
     places = top + np.outer(size[0] * (1.0 - np.cos(angle)), way)

@@ -166,7 +166,7 @@ def _draw_hour(p: SceneParameters, rng: np.random.Generator) -> tuple[Light, Wea
 def draw_camera(rng: np.random.Generator) -> tuple[CameraModel, Optics]:
     """A camera of any common size and angle of view whose lens does not fold inside the image."""
     for _ in range(_ATTEMPTS):
-        camera = _draw_lens(rng)
+        camera = draw_lens(rng)
         try:
             return camera, optics_of(camera)
         except InputError:
@@ -174,7 +174,8 @@ def draw_camera(rng: np.random.Generator) -> tuple[CameraModel, Optics]:
     raise InputError("no drawn lens was whole", hint="a narrower range of distortions")
 
 
-def _draw_lens(rng: np.random.Generator) -> CameraModel:
+def draw_lens(rng: np.random.Generator) -> CameraModel:
+    """A camera whose lens may fold in the corners."""
     width, height = SIZES[int(rng.choice(len(SIZES), p=_SHARES / _SHARES.sum()))]
     focal = width * float(np.exp(rng.uniform(math.log(0.45), math.log(2.2))))
     # Cropped images have their principal point anywhere near the middle.

@@ -13,6 +13,7 @@ from pipeline.simulation import camera as simulated
 from pipeline.simulation.camera import Look, optics_of, render
 from pipeline.simulation.furniture import post
 from pipeline.simulation.paint import Line, Paint
+from pipeline.simulation.roadway import Roadway
 from pipeline.simulation.scene import Light, Scene, SceneParameters, draw_scene
 from pipeline.simulation.shadows import shadow_map
 from pipeline.simulation.solids import Solids, upright
@@ -195,3 +196,47 @@ def test_the_sun_casts_the_shadow_of_a_pole():
         uv, _ = project(PINHOLE, apply(inverse(ahead()), np.array([[12.0, y, 0.0], [10.5, y, 0.0]])))
         (u, v), (u0, v0) = np.rint(uv).astype(int)
         assert (grey[v, u] < 0.85 * grey[v0, u0]) == shaded
+
+
+def test_a_pixel_is_what_covers_most_of_it():
+    votes = [
+        [labels.POLE, labels.POLE, labels.SKY, labels.SKY],
+        [labels.POLE, labels.SKY, labels.SKY, labels.SKY],
+        [labels.LANE, labels.IGNORE, labels.IGNORE, labels.IGNORE],
+        [labels.LANE, labels.LANE, labels.IGNORE, labels.IGNORE],
+        [labels.IGNORE] * 4,
+        [labels.OTHER, labels.OTHER, labels.OTHER, labels.POLE],
+    ]
+    expected = [labels.POLE, labels.SKY, labels.IGNORE, labels.LANE, labels.IGNORE, labels.OTHER]
+    assert simulated._voted(np.array(votes, dtype=np.uint8)).tolist() == expected  # noqa: SLF001 - the rule alone
+
+
+@pytest.mark.parametrize("radius", [0.04, 0.08, 0.15])
+def test_poles_of_known_width_are_labelled_as_wide_and_as_many(radius):
+    places = np.array([-6.0, -2.0, 1.5, 5.0])
+    poles = [post(np.array([15.0, y, 0.0]), 6.0, radius, (0.0, 0.0)) for y in places]
+    pole = take(street(poles), PINHOLE, ahead()).labels == labels.POLE
+    rows = pole[20:70]
+    starts = np.diff(np.pad(rows, ((0, 0), (1, 0))).astype(int), axis=1) == 1
+    assert (starts.sum(axis=1) == len(places)).all()
+    assert rows.sum(axis=1).mean() / len(places) == pytest.approx(400.0 * 2.0 * radius / 15.0, abs=0.6)
+
+
+def test_paint_worn_away_is_road_and_what_is_half_gone_is_not_labelled():
+    scene = dataclasses.replace(street(lines=[Line(0.0, 1.5)]), roadway=Roadway(wear=0.7))
+    rough = draw_textures(np.random.default_rng(0))
+    worn = take(dataclasses.replace(scene, textures=rough), PINHOLE, ahead(pitch=0.05)).labels
+    whole = take(street(lines=[Line(0.0, 1.5)]), PINHOLE, ahead(pitch=0.05)).labels
+    strip = whole == labels.LANE
+    assert set(np.unique(worn[strip])) == {labels.LANE, labels.ROAD, labels.IGNORE}
+    assert 0.1 < (worn[strip] == labels.LANE).mean() < 0.9
+    assert not (worn[~strip] == labels.LANE).any()
+
+
+def test_bloom_and_veil_add_light_and_leave_the_labels(town):
+    T = in_town(town)
+    bare = take(town, PINHOLE, T, PLAIN)
+    hazy = take(town, PINHOLE, T, dataclasses.replace(PLAIN, bloom=0.05, veil=0.1))
+    np.testing.assert_array_equal(bare.labels, hazy.labels)
+    assert (hazy.image.pixels.astype(int) - bare.image.pixels).min() >= 0
+    assert hazy.image.pixels.min() > 60

@@ -36,7 +36,7 @@ def test_some_roads_have_yellow_lines():
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_letters_are_read_by_who_drives_towards_them(way):
     """An L has its foot near the driver and its bar to the right of the stem."""
-    strokes = marks._word("L", (50.0, 0.0), way, WHITE, np.random.default_rng(1))
+    strokes = marks.lettering("L", (50.0, 0.0), way, WHITE, np.random.default_rng(1))
     paint = Paint((), (), tuple(strokes))
     s, d = np.meshgrid(np.linspace(44.0, 56.0, 600), np.linspace(-1.0, 1.0, 400), indexing="ij")
     on = paint.covers(s.ravel().astype(np.float32), d.ravel().astype(np.float32)).reshape(s.shape)
@@ -50,7 +50,7 @@ def test_letters_are_read_by_who_drives_towards_them(way):
 
 def test_an_arrow_ahead_ends_in_its_tip():
     for seed in range(20):
-        patches, strokes = marks._arrow(10.0, 0.0, 1.0, np.random.default_rng(seed))
+        patches, strokes = marks.lane_arrow(10.0, 0.0, 1.0, np.random.default_rng(seed))
         s, d = np.meshgrid(np.linspace(9.0, 17.0, 400), np.linspace(-1.5, 1.5, 300), indexing="ij")
         on = Paint((), tuple(patches), tuple(strokes)).covers(
             s.ravel().astype(np.float32), d.ravel().astype(np.float32)

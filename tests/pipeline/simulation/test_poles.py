@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -11,8 +13,8 @@ MAKERS = {
     "signed post": lambda rng: poles.signed_post(PLACE, 0.2, (0.01, 0.0), rng),
     "board": lambda rng: poles.board(PLACE, 0.2, rng),
     "signal": lambda rng: poles.signal(PLACE, 0.2, 1.0, (0.0, 0.0), rng),
-    "gantry": lambda rng: poles.gantry(PLACE, PLACE + [0.0, 12.0, 0.0], 0.0, rng),
-    "utility poles": lambda rng: poles.utility_poles([PLACE, PLACE + [30.0, 1.0, 0.0]], 0.0, rng),
+    "gantry": lambda rng: poles.gantry(PLACE, PLACE + np.array([0.0, 12.0, 0.0]), 0.0, rng),
+    "utility poles": lambda rng: poles.utility_poles([PLACE, PLACE + np.array([30.0, 1.0, 0.0])], 0.0, rng),
     "bollard": lambda rng: poles.bollard(PLACE, (0.0, 0.0), rng),
 }
 
@@ -46,11 +48,11 @@ def test_wires_join_the_poles_and_are_not_poles():
 
 def test_a_bent_arm_has_no_gaps():
     way = np.array([0.0, 1.0, 0.0])
-    arm = poles._bent(np.array([0.0, 0.0, 6.0]), way, (2.0, 1.0), 0.05, (0.2, 0.2, 0.2))
+    arm = poles.bent_arm(np.array([0.0, 0.0, 6.0]), way, (2.0, 1.0), 0.05, (0.2, 0.2, 0.2))
     ends = [(p.centre - p.half[2] * p.axes[:, 2], p.centre + p.half[2] * p.axes[:, 2]) for p in arm]
     np.testing.assert_allclose(ends[0][0], [0.0, 0.0, 6.0], atol=1e-9)
     np.testing.assert_allclose(ends[-1][1], [0.0, 2.0, 7.0], atol=1e-9)
-    for before, after in zip(ends[:-1], ends[1:], strict=True):
+    for before, after in pairwise(ends):
         np.testing.assert_allclose(before[1], after[0], atol=1e-9)
 
 

@@ -95,3 +95,46 @@ def test_leaves_let_rays_pass_at_the_rim_only():
     assert bare[offset < 0.8].all()
     assert not bare[offset > 0.9].any()
     assert dense[offset < 0.98].all()
+
+
+def wall_of_rays(count=400):
+    """Rays along x that meet the plane x = 10 in a grid of 2 by 1.5 m about (10, 0, 1)."""
+    y, z = np.meshgrid(np.linspace(-1.0, 1.0, count), np.linspace(0.0, 1.5, count))
+    directions = np.column_stack([np.full(y.size, 10.0), y.ravel(), z.ravel() - 0.75])
+    return rays((0.0, 0.0, 0.75), directions / 10.0)
+
+
+def railing(kind, pitch=0.5, bar=0.5):
+    """Share of the rays that a railing of 3 by 1.5 m stops; numbers 0..1 that its pattern follows from."""
+    grain = np.full((64, 64), 0.5, dtype=np.float32)
+    grain[0, :] = bar
+    grain[0, 0], grain[0, 61] = kind, pitch
+    axes = upright(math.pi / 2)
+    fence = solid(Shape.BOX, (10.0, 0.0, 0.75), axes, (1.5, 0.01, 0.75), Material.RAILING)
+    t = Solids.of([fence]).meet(0, wall_of_rays(), WHOLE, grain)
+    return float(np.isfinite(t).mean())
+
+
+def test_a_railing_stops_what_its_bars_and_rails_cover():
+    # Uprights cover a share of the width, two rails 0.12 m of 1.5 m of the height.
+    for bar in (0.0, 1.0):
+        share = 0.12 + 0.25 * bar
+        assert railing(0.9, bar=bar) == pytest.approx(share + (1.0 - share) * 0.12 / 1.5, abs=0.02)
+    assert railing(0.4) == pytest.approx(0.84 + 0.16 * 0.08, abs=0.02)
+    wires = 2.0 * 0.014 / 0.12
+    assert railing(0.1) == pytest.approx(wires + 0.08, abs=0.04)
+
+
+def test_a_canopy_is_dense_inside_and_torn_at_its_rim():
+    grain = np.random.default_rng(1).permutation(256 * 256).reshape(256, 256).astype(np.float32) / 65536.0
+    crown = solid(Shape.ELLIPSOID, (10.0, 0.0, 0.75), np.eye(3), (0.75, 0.75, 0.75), Material.CANOPY)
+    ball = solid(Shape.ELLIPSOID, (10.0, 0.0, 0.75), np.eye(3), (0.75, 0.75, 0.75))
+    both = Solids.of([crown, ball])
+    grid = wall_of_rays()
+    leaves, whole = (np.isfinite(both.meet(k, grid, WHOLE, grain)[0]) for k in range(2))
+    assert not (leaves & ~whole).any()
+    y, z = grid.direction[1, 0], grid.direction[2, 0]
+    away = 10.0 * np.hypot(y, z) / 0.75
+    assert leaves[away < 0.5].mean() > 0.85
+    rim = whole & (away > 0.93)
+    assert 0.1 < leaves[rim].mean() < 0.85

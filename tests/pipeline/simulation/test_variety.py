@@ -46,7 +46,7 @@ def test_towns_and_country_days_and_nights_dry_and_wet_are_drawn(drawn):
 
 
 def test_a_lens_that_folds_is_drawn_again(monkeypatch):
-    lenses, tried = variety._draw_lens, []
+    lenses, tried = variety.draw_lens, []
 
     def folding_first(rng):
         lens = lenses(rng)
@@ -58,7 +58,7 @@ def test_a_lens_that_folds_is_drawn_again(monkeypatch):
         wide[2, 2] = 1.0
         return type(lens)("plumb_bob", wide, strong, lens.width, lens.height)
 
-    monkeypatch.setattr(variety, "_draw_lens", folding_first)
+    monkeypatch.setattr(variety, "draw_lens", folding_first)
     camera, optics = draw_camera(np.random.default_rng(3))
     assert len(tried) == 2
     assert camera is tried[1]

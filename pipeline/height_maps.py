@@ -94,9 +94,9 @@ def height_map(mask: NDArray[np.bool_], mode: Mode, *, gamma0: float, gamma1: fl
 
 
 def _falloff(region: NDArray[np.bool_], gamma: float) -> Floats32:
-    """``gamma^d``, float32 (h,w), d the city-block distance from within the region to the nearest px outside it.
+    """``gamma^d``, float32 (h,w), d the city-block distance to the nearest px outside the region.
 
     1 outside the region.
     """
     distance = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L1, 3)
-    return np.exp(np.asarray(distance, dtype=np.float32) * np.float32(np.log(gamma)))
+    return np.asarray(np.exp(distance * np.float32(np.log(gamma))), dtype=np.float32)

@@ -1,8 +1,8 @@
 """Extrinsics from two parallel lines and a third one: the closed form of P3L (CRLF (10)-(13), generalised).
 
 The planes through the camera centre and the two image lanes meet in the lanes' direction; the pole lies in a
-third plane and keeps its angle to the lanes: one trigonometric equation with two roots. Two directions fix the
-rotation, three planes the translation. The pole may lean, the LiDAR may have any axes (FORMULAS B (11)).
+third plane and keeps its angle to the lanes: one trigonometric equation with two roots. Two directions fix
+the rotation, three planes the translation. The pole may lean, the LiDAR may have any axes (FORMULAS B (11)).
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from pipeline.records import Floats
 NEAREST_M = 0.5
 """m; what image and cloud both see lies further in front of the camera (FORMULAS B (12), 4 i)."""
 _NO_SINE = 1e-6
-"""Sine of an angle below which two directions or planes count as one: nothing but rounding tells them apart."""
+"""Sine of an angle below which two directions or planes count as one: only rounding tells them apart."""
 _ROOT_SLACK = 1.05
 """|c| / r up to which a missing root is put down to noise: 1.05 is 3 deg for a pole at right angles."""
 
@@ -30,11 +30,11 @@ class Degeneracy(IntEnum):
     POLE_ABEAM = 2
     """The pole's plane is square to the lanes: every roll fits."""
     POLE_DEAD_AHEAD = 3
-    """The pole's plane holds the lanes' direction: nothing tells how far along the lanes the camera stands."""
+    """The pole's plane holds the lanes' direction: how far along the lanes the camera stands is lost."""
     POLE_ALONG_LANES = 4
     """The third line is parallel to the lanes."""
     NO_ROOT = 5
-    """No line of the pole's plane encloses the right angle with the lanes: the three do not belong together."""
+    """No line of the pole's plane keeps the pole's angle to the lanes: the three do not belong together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +142,7 @@ def _rotations(a: Floats, n3: Floats, ratio: Floats, d_l: Floats, d_p: Floats) -
 
 
 def _translations(N: Floats, R: Floats, points: Floats) -> Floats:
-    """``n_i . t = -n_i . (R p_i)`` for normals (M,3,3) and points (M,3,3), rows i, and R (M,4,3,3): (M,4,3)."""
+    """Shifts (M,4,3) of ``n_i . t = -n_i . (R p_i)`` for normals and points (M,3,3), and R (M,4,3,3)."""
     right = -np.einsum("mic,mkcl,mil->mki", N, R, points, optimize=True)
     return np.asarray(np.linalg.solve(N[:, None], right[..., None])[..., 0])
 
@@ -173,3 +173,14 @@ def upright(T_cam_lidar: Floats, foot: Floats, top: Floats) -> NDArray[np.bool_]
         for point in (foot, top)
     )
     return np.asarray(y_top * depths(T_cam_lidar, foot) < y_foot * depths(T_cam_lidar, top))
+
+
+def above(T_cam_lidar: Floats, point: Floats, up: Floats) -> NDArray[np.bool_]:
+    """Whether the camera centre lies on the side ``up`` (...,3) of the ground through a point (...,3) of it.
+
+    One set in a thousand has a second root from below the road that :func:`in_front` and :func:`upright` let
+    pass; lanes are seen from above.
+    """
+    R, t = T_cam_lidar[..., :3, :3], T_cam_lidar[..., :3, 3]
+    centre = -np.einsum("...ji,...j->...i", R, t)
+    return np.asarray(np.einsum("...i,...i->...", centre - point, up) > 0.0)

@@ -1,7 +1,7 @@
 """How well the points of lanes and poles meet their masks: J of CRLF (9) and the search for its maximum.
 
-J does not say which point belongs to which stroke: it needs no matching, and has side maxima. It serves to rank
-coarse candidates and to draw one of them in; where lines can be matched, ``pipeline.plk`` is sharper.
+J does not say which point belongs to which stroke: it needs no matching, and has side maxima. It serves to
+rank coarse candidates and to draw one of them in; where lines can be matched, ``pipeline.plk`` is sharper.
 """
 
 from collections.abc import Sequence
@@ -59,8 +59,8 @@ def semantic_cost(
 ) -> Floats:
     """J of CRLF (9) for many extrinsics at once.
 
-    The mean height over ALL points of each class, summed over the classes: points that do not project into the
-    image, nearer than 0.1 m or beyond the lens among them, count 0. A class without points is left out.
+    The mean height over ALL points of each class, summed over the classes: points that do not project into
+    the image, nearer than 0.1 m or beyond the lens among them, count 0. A class without points is left out.
 
     Args:
         T_cam_lidar: float64 (S,4,4).
@@ -87,7 +87,7 @@ def _heights(
 ) -> NDArray[np.float64]:
     """Sums (S,) of the heights at which points (P,3) land under extrinsics (S,4,4).
 
-    Looked up bilinearly: with the nearest px J is a stair whose steps the last stages of a search can not see.
+    Looked up bilinearly: with the nearest px J is a stair too coarse for the last stages of a search.
     """
     homogeneous = np.concatenate([xyz.T, np.ones((1, len(xyz)), dtype=np.float32)])
     grid = _grid_matrix(maps, camera)
@@ -165,12 +165,12 @@ def random_search(
     maps: Sequence[HeightMaps],
     camera: CameraModel,
     rng: np.random.Generator,
-    parameters: RandomSearchParameters = RandomSearchParameters(),  # noqa: B008 - frozen
+    parameters: RandomSearchParameters = RandomSearchParameters(),
 ) -> Refinement:
-    """Algorithm 1 of CRLF: random steps around the best extrinsic so far, ten times smaller from stage to stage.
+    """Algorithm 1 of CRLF: random steps from the best extrinsic so far, smaller from stage to stage.
 
     ``R <- Exp(eta dr) R, t <- t + eta dt``, the decoupled update. Samples are judged in blocks and the first
-    improvement is taken, after which the rest is judged anew: the outcome is that of one sample after the other.
+    improvement is taken, after which the rest is judged anew: the outcome is that of one after the other.
 
     Args:
         T_start: float64 (4,4).
@@ -179,7 +179,11 @@ def random_search(
         camera: Intrinsics.
         rng: Draws the steps.
         parameters: Widths and number of the steps.
+
+    Raises:
+        InputError: No maps.
     """
+    _require_stages(maps)
     R, t = T_start[:3, :3], T_start[:3, 3]
     evaluations, best = 0, 0.0
     for stage, heights in enumerate(maps):
@@ -212,6 +216,11 @@ _FIRST_BLOCK, _LAST_BLOCK = 8, 512
 """Samples judged at once: few where improvements come soon, for what follows one is judged again."""
 
 
+def _require_stages(maps: Sequence[HeightMaps]) -> None:
+    if not maps:
+        raise InputError("a search without height maps", hint="one per stage: plateau, then ridge")
+
+
 def _transforms(R: Floats, t: Floats) -> Floats:
     """4x4 matrices (S,4,4) of rotations (S,3,3) and translations (S,3)."""
     T = np.zeros((len(R), 4, 4))
@@ -239,7 +248,7 @@ class EvolutionParameters:
         angle: rad; standard deviation of the first generation: starts are some 6 deg off at worst.
         shift: m; likewise.
         narrow: Width at which the next stage begins, in units of the first.
-        population: Extrinsics a generation: several times the 9 that six unknowns need, for J has side maxima.
+        population: Extrinsics a generation: five times what six unknowns need, for J has side maxima.
         generations: Per stage, at most.
         least: Width at which a stage ends, in units of the first: 0.006 deg and 1 mm.
     """
@@ -258,12 +267,12 @@ def evolution_search(
     maps: Sequence[HeightMaps],
     camera: CameraModel,
     rng: np.random.Generator,
-    parameters: EvolutionParameters = EvolutionParameters(),  # noqa: B008 - frozen
+    parameters: EvolutionParameters = EvolutionParameters(),
 ) -> Refinement:
     """The same maximum by evolution: it learns along which directions turns and shifts trade for each other.
 
-    Random steps of one width for all directions creep along the ridge that lanes leave between roll and shift;
-    steps of the learned covariance run along it.
+    Random steps of one width for all directions creep along the ridge that lanes leave between roll and
+    shift; steps of the learned covariance run along it.
 
     Args:
         T_start: float64 (4,4).
@@ -272,7 +281,14 @@ def evolution_search(
         camera: Intrinsics.
         rng: Draws the generations.
         parameters: Widths, population and ends.
+
+    Returns:
+        The mean of the last generation, or the start where J says nothing against it.
+
+    Raises:
+        InputError: No maps.
     """
+    _require_stages(maps)
     unit = np.array([parameters.angle] * 3 + [parameters.shift] * 3)
     mean, shape, width = np.zeros(6), np.eye(6), 1.0
     evaluations = 0
@@ -290,14 +306,16 @@ def evolution_search(
             if state.width * np.sqrt(float(values[-1])) < parameters.least:
                 break
         mean, shape = state.mean, state.shape
-    T = _retracted(T_start, (unit * mean)[None])
-    cost = float(semantic_cost(T, points, maps[-1], camera)[0]) if maps else 0.0
-    return Refinement(se3.transform(se3.orthonormalised(T[0, :3, :3]), T[0, :3, 3]), cost, evaluations + 1)
+    both = np.concatenate([_retracted(T_start, (unit * mean)[None]), T_start[None]])
+    costs = semantic_cost(both, points, maps[-1], camera)
+    better = 0 if costs[0] > costs[1] else 1
+    T = se3.transform(se3.orthonormalised(both[better, :3, :3]), both[better, :3, 3])
+    return Refinement(T, float(costs[better]), evaluations + 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Generation:
-    """State of the evolution: mean (6,), shape (6,6) and width of its steps, and both evolution paths (6,)."""
+    """Mean (6,), shape (6,6) and width of the steps, and both evolution paths (6,)."""
 
     mean: Floats
     shape: Floats

@@ -1,10 +1,12 @@
-"""Straight roads with perfect masks and the points of their paint and poles, and pixel-by-pixel oracles of J."""
+"""Straight roads with perfect masks, and the points and lines of their paint and poles."""
 
 import cv2
 import numpy as np
 
 from pipeline import se3
-from pipeline.records import CameraModel, Masks
+from pipeline.cameras import project
+from pipeline.cloud_lines import cloud_line, total_least_squares
+from pipeline.records import CameraModel, CloudLine, ImageLine, Masks
 from pipeline.semantic_cost import SemanticPoints
 
 HEIGHT = 1.73
@@ -15,6 +17,7 @@ CAMERA = CameraModel(
     1242,
     375,
 )
+MOST_ANGLE = np.radians(6.0)
 LANE_HALF_M, POLE_RADIUS_M = 0.075, 0.1
 
 
@@ -100,7 +103,52 @@ def masks_of(T, strips, posts, *, camera=CAMERA, scale=1.0):
     return Masks(lane, pole, lane.astype(np.float32), pole.astype(np.float32), scale, scale)
 
 
-def disturbed(T, rng, *, angle=np.radians(6.0), shift=1.0):
+def disturbed(T, rng, *, angle=MOST_ANGLE, shift=1.0):
     """A start that is off by up to 6 deg and 1 m on each axis (FORMULAS B (14))."""
     R = se3.exp_so3(rng.uniform(-angle, angle, 3)) @ T[:3, :3]
     return se3.transform(R, T[:3, 3] + rng.uniform(-shift, shift, 3))
+
+
+def lines_of(rng, T, strips, posts, *, camera=CAMERA, sigma_px=1.0, sigma_m=0.03):
+    """Cloud lines and image lines of a road as fits of noisy points and pixels give them; poles unsorted.
+
+    The image shows a lane until 40 m, or as far as the paint goes, and a pole from its foot up to the border.
+    """
+    cloud, image = [], []
+    for y, a, b in strips:
+        ends = np.array([[a, y, -HEIGHT], [b, y, -HEIGHT]])
+        cloud.append(fitted("lane", ends, rng, 40, sigma_m))
+        image += _imaged("lane", np.array([[a, y, -HEIGHT], [b + 6, y, -HEIGHT]]), T, camera, sigma_px, rng)
+    for x, y, top in posts:
+        lean = rng.normal(0, np.radians(0.7), 2)
+        up = np.array([*lean, 1.0])
+        foot = np.array([x, y, -HEIGHT])
+        cloud.append(
+            fitted("pole", np.stack([foot + 0.73 * up, foot + (top + HEIGHT) * up]), rng, 15, sigma_m)
+        )
+        image += _imaged("pole", np.stack([foot, foot + 5.0 * up]), T, camera, sigma_px, rng)
+    return cloud, image
+
+
+def fitted(label, ends, rng, count=15, sigma_m=0.03):
+    """A cloud line as a fit of noisy points between two ends gives it; either end may come first."""
+    along = ends[1] - ends[0]
+    xyz = ends[0] + np.sort(rng.uniform(0, 1, count))[:, None] * along + rng.normal(0, sigma_m, (count, 3))
+    line = cloud_line(label, total_least_squares(xyz), np.arange(count))
+    if rng.random() < 0.5:
+        return line
+    length = float(np.linalg.norm(line.end - line.start))
+    return CloudLine(
+        label, line.end, line.start, line.points, line.sigma_m, line.spread, length - line.mean_m
+    )
+
+
+def _imaged(label, ends, T, camera, sigma_px, rng):
+    """The part of a projected segment inside the image, as a list of one line or none."""
+    share = np.linspace(0, 1, 400)[:, None]
+    uv, seen = project(camera, se3.apply(T, ends[0] + share * (ends[1] - ends[0])))
+    if seen.sum() < 20:
+        return []
+    shown = uv[seen]
+    start, end = (shown[k] + rng.normal(0, sigma_px, 2) for k in (0, -1))
+    return [ImageLine(label, start, end, sigma_px)] if np.linalg.norm(end - start) > 25 else []

@@ -1,0 +1,268 @@
+"""The extrinsic of a rig that nobody knows yet, from two lanes and a pole of one frame (CRLF III-C).
+
+All extrinsics that the three lines allow (``pipeline.line_triples``) are ranked by J
+(``pipeline.semantic_cost``). The best few are drawn in by every line that they can match (``pipeline.plk``)
+and ranked again. How far the best stays ahead of a different one is part of the answer.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import plk
+from pipeline.association import NO_PAIRS, Association, associate, pairs_on_overlap
+from pipeline.errors import InputError
+from pipeline.height_maps import HeightMaps
+from pipeline.line_triples import (
+    Indices,
+    Lines,
+    NoTriples,
+    NoTriplesReason,
+    TripleParameters,
+    Triples,
+    enumerate_triples,
+    is_usable,
+    largest_lines,
+)
+from pipeline.records import CameraModel, CloudLine, Floats, ImageLine, LineMatch, read_only
+from pipeline.semantic_cost import SemanticPoints, semantic_cost
+
+_L = TypeVar("_L", CloudLine, ImageLine)
+
+Reason: TypeAlias = NoTriplesReason | Literal["no candidate meets the masks"]
+"""Why a scene gives no coarse extrinsic."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseParameters:
+    """What takes part in the ranking.
+
+    Attributes:
+        triples: Which lines correspond, and what is believable.
+        all_lines: Longest lines of each class and sensor that may be matched in the end: a street has fewer,
+            and a thousand would take minutes.
+        points: Points of each class by which all candidates are ranked; the finalists meet all points.
+        finalists: Different candidates that are drawn in by all lines.
+        distinct_rad: rad; with ``distinct_m`` what makes a candidate a different one: twice the 3 deg and
+            0.5 m asked of a coarse extrinsic, within which triples of the same lines scatter.
+        distinct_m: m, of the translation.
+    """
+
+    triples: TripleParameters = field(default_factory=TripleParameters)
+    all_lines: int = 16
+    points: int = 200
+    finalists: int = 4
+    distinct_rad: float = math.radians(6.0)
+    distinct_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("all_lines", 3), ("points", 1), ("finalists", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"coarse: {name} {getattr(self, name)} is below {least}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseSolution:
+    """An extrinsic without any prior, and its rivals.
+
+    Attributes:
+        T_cam_lidar: float64 (4,4), the best.
+        cost: J of it (plateau), over all points.
+        rival_cost: J of the best candidate distinct from it, 0 where there is none: close to ``cost`` the
+            scene is ambiguous.
+        candidates: float64 (k,4,4), distinct ones, the best first.
+        costs: float64 (k,), J of each.
+        matches: The lines that the best was drawn in by; empty where it stands on its three lines alone.
+        tried: Roots that passed as believable.
+    """
+
+    T_cam_lidar: Floats
+    cost: float
+    rival_cost: float
+    candidates: Floats
+    costs: Floats
+    matches: tuple[LineMatch, ...]
+    tried: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoCoarse:
+    """The scene does not give an extrinsic, and why."""
+
+    reason: Reason
+
+
+def coarse_extrinsic(
+    cloud_lines: Sequence[CloudLine],
+    image_lines: Sequence[ImageLine],
+    points: SemanticPoints,
+    maps: HeightMaps,
+    camera: CameraModel,
+    *,
+    up: Floats | None = None,
+    parameters: CoarseParameters | None = None,
+) -> CoarseSolution | NoCoarse:
+    """Finds the extrinsic from one frame's lines without a prior (CRLF III-C, FORMULAS B (11), (12)).
+
+    Args:
+        cloud_lines: Lanes and poles, LiDAR frame; ends in any order. Other classes take no part.
+        image_lines: Lanes and poles, ideal px.
+        points: Points of the lanes and poles of the cloud.
+        maps: Plateau maps of the raw image's masks.
+        camera: Intrinsics.
+        up: float64 (3,), LiDAR frame, where up is, to some 45 deg; None: poles stand on the lanes' plane and
+            tell it, and where one does not, both signs of the ground's normal are tried.
+        parameters: What takes part; None: the defaults.
+
+    Returns:
+        The extrinsic with its rivals, or why there is none. The camera is taken to be upright: rolled by less
+        than 90 deg.
+    """
+    p = parameters or CoarseParameters()
+    lines = largest_lines(cloud_lines, image_lines, p.triples)
+    found = enumerate_triples(lines, camera, up, p.triples)
+    if isinstance(found, NoTriples):
+        return NoCoarse(found.reason)
+    some = SemanticPoints(_spread(points.lane, p.points), _spread(points.pole, p.points))
+    costs = semantic_cost(found.T_cam_lidar, some, maps, camera)
+    if costs.max() <= 0.0:
+        return NoCoarse("no candidate meets the masks")
+    order = np.argsort(-costs, kind="stable")[:_SHORTLIST]
+    apart = order[_distinct(found.T_cam_lidar[order], p)]
+    first, others = apart[: p.finalists], apart[p.finalists :]
+    frame = _Frame(_longest(cloud_lines, p.all_lines), _longest(image_lines, p.all_lines), camera)
+    drawn = [
+        _drawn_in(_Fit(found.T_cam_lidar[k], _own_lines(lines, found, int(k), camera)), frame) for k in first
+    ]
+    finalists = _kept([_Fit(found.T_cam_lidar[k], _NOTHING) for k in first], drawn, points, maps, camera)
+    final = semantic_cost(np.stack([fit.T_cam_lidar for fit in finalists]), points, maps, camera)
+    winner = finalists[int(np.argmax(final))]
+    # The lines that the triple's own uncertainty confused are told apart by what the others have added.
+    settled = _kept([winner], [_drawn_in(winner, frame)], points, maps, camera)[0]
+    beaten = [fit.T_cam_lidar for fit in finalists if fit is not winner]
+    T = np.stack([settled.T_cam_lidar, *beaten, *found.T_cam_lidar[others]])
+    final = semantic_cost(T, points, maps, camera)
+    ranked = np.concatenate([[0], 1 + np.argsort(-final[1:], kind="stable")])
+    ranked = ranked[_distinct(T[ranked], p)]
+    return CoarseSolution(
+        read_only(T[0]),
+        float(final[0]),
+        float(final[ranked[1]]) if len(ranked) > 1 else 0.0,
+        read_only(T[ranked]),
+        read_only(final[ranked]),
+        settled.used.matches,
+        len(found.T_cam_lidar),
+    )
+
+
+_SHORTLIST = 256
+"""Best candidates among which distinct ones are sought: dozens of triples show the same extrinsic."""
+
+
+def _spread(xyz: NDArray[np.float32], most: int) -> NDArray[np.float32]:
+    """At most so many of the points (N,3), evenly taken in their order."""
+    if len(xyz) <= most:
+        return xyz
+    return xyz[np.linspace(0, len(xyz) - 1, most).astype(np.int64)]
+
+
+def _distinct(T: Floats, p: CoarseParameters) -> Indices:
+    """Indices of extrinsics (N,4,4) that differ from every earlier one that was kept."""
+    kept: list[int] = []
+    left = np.ones(len(T), dtype=bool)
+    while left.any():
+        k = int(np.argmax(left))
+        kept.append(k)
+        chord = np.linalg.norm(T[:, :3, :3] - T[k, :3, :3], axis=(1, 2))
+        angle = 2.0 * np.arcsin(np.minimum(1.0, chord / np.sqrt(8.0)))
+        shift = np.linalg.norm(T[:, :3, 3] - T[k, :3, 3], axis=1)
+        left &= (angle > p.distinct_rad) | (shift > p.distinct_m)
+    return np.array(kept, dtype=np.int64)
+
+
+def _longest(lines: Sequence[_L], most: int) -> list[_L]:
+    """The longest lanes and the longest poles."""
+    by_length = sorted(
+        filter(is_usable, lines), key=lambda line: -float(np.linalg.norm(line.end - line.start))
+    )
+    return [
+        line
+        for label in ("lane", "pole")
+        for line in [line for line in by_length if line.label == label][:most]
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """The lines that may be matched."""
+
+    cloud: list[CloudLine]
+    image: list[ImageLine]
+    camera: CameraModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """An extrinsic (4,4) and the pairs that it was drawn in by."""
+
+    T_cam_lidar: Floats
+    used: Association
+
+
+_NOTHING = Association((), NO_PAIRS)
+
+
+def _own_lines(lines: Lines, found: Triples, k: int, camera: CameraModel) -> Association:
+    """The three pairs of a triple, cut to what both sensors see; fewer where they share too little."""
+    c, i = found.cloud[k], found.image[k]
+    cloud = [lines.cloud_lanes[c[0]], lines.cloud_lanes[c[1]], lines.cloud_poles[c[2]]]
+    image = [lines.image_lanes[i[0]], lines.image_lanes[i[1]], lines.image_poles[i[2]]]
+    rows, pairs = pairs_on_overlap(cloud, image, camera, found.T_cam_lidar[k])
+    own = rows[:, 0] == rows[:, 1]
+    matches = tuple(LineMatch(cloud[n], image[n]) for n in rows[own, 0].tolist())
+    return Association(matches, plk.select(pairs, own))
+
+
+_WIDEST = np.array([np.radians(5.0)] * 3 + [1.0] * 3)
+"""rad and m; how wrong a candidate may be at most: what its lines do not see is known so well."""
+_FLOOR = np.array([np.radians(0.1)] * 3 + [0.03] * 3)
+"""rad and m; what the noise model of the lines does not know of."""
+
+
+def _drawn_in(fit: _Fit, frame: _Frame) -> _Fit:
+    """Method I on the pairs of a fit, then on all lines that match under what these leave open."""
+    if len(fit.used.pairs) == 0:
+        return fit
+    K = frame.camera.K
+    prior = plk.Prior(fit.T_cam_lidar, np.diag(_WIDEST**-2.0))
+    solution = plk.method_one(fit.used.pairs, K, fit.T_cam_lidar, prior=prior, start_two=False)
+    covariance = np.linalg.inv(solution.information + prior.precision) + np.diag(_FLOOR**2)
+    wider = associate(frame.cloud, frame.image, frame.camera, solution.T_cam_lidar, covariance)
+    if len(wider.pairs) < len(fit.used.pairs):
+        return _Fit(solution.T_cam_lidar, fit.used)
+    solution = plk.method_one(wider.pairs, K, solution.T_cam_lidar, prior=prior, start_two=False)
+    return _Fit(solution.T_cam_lidar, wider)
+
+
+_ONE_PX = 0.02
+"""Of J: what one px of mean misfit costs one class. The plateau is flat: smaller changes say nothing against
+the lines, larger ones that a wrong pair was among them."""
+
+
+def _kept(
+    before: Sequence[_Fit],
+    after: Sequence[_Fit],
+    points: SemanticPoints,
+    maps: HeightMaps,
+    camera: CameraModel,
+) -> list[_Fit]:
+    """Of each fit what the lines made of it, unless it lost by J."""
+    T = np.stack([fit.T_cam_lidar for fit in (*before, *after)])
+    old, new = np.split(semantic_cost(T, points, maps, camera), 2)
+    return [
+        b if lost else a for a, b, lost in zip(after, before, (new < old - _ONE_PX).tolist(), strict=True)
+    ]

@@ -4,7 +4,7 @@ import dataclasses
 import resource
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TypedDict
 
@@ -22,6 +22,8 @@ from pipeline.parameters import Parameters
 from pipeline.records import CameraImage, FramePair, PointCloud
 from pipeline.segmentation import Segmenter
 from pipeline.watch import Mount, Watch
+from tests.bench import dense_crf
+from tests.bench.dense_crf import least
 
 STAGES = {
     "decode cloud": 1.0,
@@ -41,8 +43,6 @@ _BEGINNING = 12
 """Frames that do not count where there are more: the first 1.2 s, in which windows are short."""
 
 _MOST_FRAMES = 40
-
-_REPEATS = 5
 
 
 class Cost(TypedDict):
@@ -163,23 +163,18 @@ def _ratios(stages: dict[str, Cost]) -> dict[str, float]:
 def _of_masks(
     mount: Mount, parameters: Parameters, segmenter: Segmenter, pair: FramePair
 ) -> dict[str, float]:
-    """The CRF on the network's grid, half of the image's, against coarser and none."""
+    """The masks of one frame with their CRFs, on the network's grid, half of the image's, against none."""
     pixels = pair.image.pixels
-    fine = segmenter.probabilities(pixels)
-    rows, columns = fine.shape[1] // 2, fine.shape[2] // 2
-    coarse = np.stack([cv2.resize(p, (columns, rows), interpolation=cv2.INTER_AREA) for p in fine])
+    seen = segmenter.probabilities(pixels)
     horizon = horizon_line(mount.camera, mount.T_cam_lidar[:3, :3] @ mount.up)
     plain = dataclasses.replace(parameters.masks, crf=None)
-
-    def spent(probabilities: np.ndarray, how: object) -> float:
-        settings = plain if how is None else parameters.masks
-        return _least(lambda: masks_from_probabilities(probabilities, pixels, settings, horizon))
-
-    whole = spent(fine, parameters)
-    return {
-        "masks: CRF on a quarter grid / on the half grid": spent(coarse, parameters) / whole,
-        "masks: without CRF / with": spent(fine, None) / whole,
+    costs = {
+        settings: least(lambda settings=settings: masks_from_probabilities(seen, pixels, settings, horizon))
+        for settings in (parameters.masks, plain)
     }
+    return {"masks: without CRF / with": costs[plain] / costs[parameters.masks]} | dense_crf.measure(
+        seen, pixels, lambda: masks_from_probabilities(seen, pixels, parameters.masks, horizon)
+    )
 
 
 def _of_judgements(location: str, mount: Mount, parameters: Parameters, intake: Intake) -> dict[str, float]:
@@ -195,13 +190,3 @@ def _of_judgements(location: str, mount: Mount, parameters: Parameters, intake: 
             watch.step(pair, clocks[name].stage)
     thinned, full = (clocks[name].cost("judgement")["process_ms"] for name in ("thinned", "full"))
     return {"judgement: thinned edges / all": thinned / full}
-
-
-def _least(work: Callable[[], object]) -> float:
-    """Least process time of some repetitions, ms."""
-    times = []
-    for _ in range(_REPEATS):
-        begun = time.process_time()
-        work()
-        times.append(1e3 * (time.process_time() - begun))
-    return min(times)

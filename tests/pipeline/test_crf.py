@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from pipeline.crf import AppearanceKernel, CrfParameters, SmoothnessKernel, mean_field
 from pipeline.errors import InputError, RigError
-from pipeline.permutohedral import _numbered
 
 ROOT = Path(__file__).parents[2]
 _SPEC = importlib.util.spec_from_file_location("dense_crf", ROOT / "tests" / "oracles" / "dense_crf.py")
@@ -136,6 +135,30 @@ class TestAgainstBruteForce:
         turned, _ = both(unary[[2, 0, 1]], image, smoothness=SMOOTH, appearance=LIKE)
         np.testing.assert_allclose(turned, got[[2, 0, 1]], atol=1e-4)
 
+    def test_order_of_channels_is_of_no_account(self):
+        unary, image = random_scene(np.random.default_rng(20), 3, 24, 24)
+        got, _ = both(unary, image, smoothness=SMOOTH, appearance=LIKE)
+        sxy, (red, green, blue), compat = LIKE
+        swapped = (sxy, (blue, red, green), compat)
+        turned, exact = both(
+            unary, np.ascontiguousarray(image[..., [2, 0, 1]]), smoothness=SMOOTH, appearance=swapped
+        )
+        # The lattice's directions are not those of the colours: equal but for its own error.
+        assert np.abs(turned - got).mean() < 0.006
+        assert np.abs(turned - exact).mean() < 0.005
+
+    @pytest.mark.parametrize("axis", [0, 1])
+    def test_a_mirrored_image_has_mirrored_marginals(self, axis):
+        unary, image = random_scene(np.random.default_rng(21), 3, 24, 30)
+        got, _ = both(unary, image, smoothness=SMOOTH, appearance=LIKE)
+        mirrored = lattice(
+            np.ascontiguousarray(np.flip(unary, axis + 1)),
+            np.ascontiguousarray(np.flip(image, axis)),
+            smoothness=SMOOTH,
+            appearance=LIKE,
+        )
+        assert np.abs(np.flip(mirrored, axis + 1) - got).mean() < 0.006
+
     def test_a_constant_per_pixel_is_of_no_account(self):
         rng = np.random.default_rng(9)
         unary, image = random_scene(rng, 2, 20, 20)
@@ -198,23 +221,6 @@ class TestRegion:
         np.testing.assert_array_equal(everywhere, mean_field(unary, image, self.PARAMETERS))
         nowhere = mean_field(unary, image, self.PARAMETERS, np.zeros((16, 16), dtype=bool))
         np.testing.assert_array_equal(nowhere, mean_field(unary, image, CrfParameters(None, None)))
-
-
-class TestNumbering:
-    @given(st.lists(st.integers(-(2**62), 2**62) | st.integers(0, 20), min_size=1, max_size=300))
-    def test_as_numpy_unique(self, values):
-        keys = np.array(values, dtype=np.int64)
-        unique, place = _numbered(keys)
-        expected, inverse = np.unique(keys, return_inverse=True)
-        np.testing.assert_array_equal(unique, expected)
-        np.testing.assert_array_equal(place, inverse)
-
-    def test_full_buckets(self):
-        # Far more different keys than buckets of the smallest table: most have to share.
-        keys = np.random.default_rng(0).integers(0, 2**61, 4000).repeat(3)
-        unique, place = _numbered(keys)
-        np.testing.assert_array_equal(unique[place], keys)
-        assert len(unique) == 4000
 
 
 class TestRefusals:

@@ -69,6 +69,7 @@ class Look:
         noise: Standard deviation at mid grey, grey levels.
         tint: Gain of blue, green, red.
         bloom: Share of the light that the glass scatters widely.
+        contrast: 0 the tone curve of a plain power law, 1 one with toe and shoulder, as most cameras have.
         veil: Light that haze on the glass adds everywhere, relative to white.
     """
 
@@ -78,6 +79,7 @@ class Look:
     noise: float = 1.8
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     bloom: float = 0.0
+    contrast: float = 0.0
     veil: float = 0.0
 
 
@@ -244,7 +246,10 @@ def _developed(radiance: F32, look: Look, rng: np.random.Generator) -> NDArray[n
     gain = _exposure(light[::4, ::4], look.grey)
     if look.bloom > 0.0 or look.veil > 0.0:
         light = _scattered(light, gain, look)
-    grey = np.clip(gain * light, 0.0, 1.0) ** np.float32(_GAMMA) * np.float32(255.0)
+    grey = np.clip(gain * light, 0.0, 1.0) ** np.float32(_GAMMA)
+    if look.contrast > 0.0:
+        grey += np.float32(look.contrast) * (grey * grey * (3.0 - 2.0 * grey) - grey)
+    grey *= np.float32(255.0)
     grain = rng.standard_normal(grey.shape, dtype=np.float32)
     # Shot noise after the tone curve: about even over the grey levels, a little stronger in the dark.
     grey += np.float32(look.noise) * grain * (1.2 - grey * np.float32(0.4 / 255.0))

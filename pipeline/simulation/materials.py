@@ -139,7 +139,7 @@ def _poster(s: Surfaces, albedo: F32) -> None:
     column, row = np.floor(across * (0.4 + lot[:, 0])), np.floor(up * (0.6 + lot[:, 1]))
     for c in range(3):
         hue = sample(s.textures.fine, column + 3.3 * c, row + 0.7 * c, 1.0)
-        albedo[c, k] = np.clip(0.25 * np.exp(0.9 * hue), 0.02, 0.8)
+        albedo[c, k] = np.clip(0.22 * np.exp(0.6 * hue), 0.02, 0.8)
     line = (np.mod(up, 0.34) < 0.14) & (np.mod(row + column, 2.0) < 1.0)
     letter = sample(s.textures.fine, np.floor(across * 9.0), np.floor(up / 0.34), 1.0) > -0.2
     albedo[:, k[line & letter]] = np.float32(0.7)

@@ -248,7 +248,7 @@ def _strewn(surface: RoadSurface, p: SceneParameters, side: float, rng: np.rando
     things: list[tuple[float, Callable[[Floats, float], list[Solid]]]] = [
         (6.0 if p.town else 0.2, lambda place, _: clutter.people(place, rng)),
         (3.0 if p.town else 0.5, lambda place, heading: clutter.bin_or_box(place, heading, rng)),
-        (1.0, lambda place, heading: clutter.billboard(place, heading, rng)),
+        (0.5, lambda place, heading: clutter.billboard(place, heading, rng)),
         (1.5, lambda place, _: clutter.thicket(place, float(rng.uniform(0.3, 0.9)), rng)),
     ]
     solids: list[Solid] = []

@@ -85,7 +85,8 @@ def draw_variety(rng: np.random.Generator) -> Variety:
         noise=float(rng.uniform(0.5, 3.0) + 3.0 * night),
         tint=tuple(np.exp(rng.normal(0.0, 0.08, 3)).tolist()),
         bloom=float(rng.uniform(0.0, 0.06) if night > 0.0 else rng.uniform(0.0, 0.02)),
-        veil=float(rng.uniform(0.01, 0.12)) if rng.random() < 0.2 else 0.0,
+        contrast=float(rng.uniform(0.0, 1.0)),
+        veil=float(rng.uniform(0.01, 0.12)) if rng.random() < 0.12 else 0.0,
     )
     return Variety(
         parameters,

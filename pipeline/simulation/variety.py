@@ -44,7 +44,7 @@ class Variety:
 
     Attributes:
         parameters: Of the street.
-        camera: Intrinsics.
+        optics: Of the camera.
         height: Of the camera above the road, m.
         tilt: Roll, pitch (nose down), yaw of the camera, rad.
         aside: Of the own vehicle from the middle of its lane, m to the left.
@@ -56,7 +56,7 @@ class Variety:
     """
 
     parameters: SceneParameters
-    camera: CameraModel
+    optics: Optics
     height: float
     tilt: tuple[float, float, float]
     aside: float
@@ -66,13 +66,18 @@ class Variety:
     snow: float
     screen: Windscreen
 
+    @property
+    def camera(self) -> CameraModel:
+        """Intrinsics."""
+        return self.optics.camera
+
 
 def draw_variety(rng: np.random.Generator) -> Variety:
     """Draws what the next picture shows and by which camera."""
     parameters = _draw_parameters(rng)
     light, weather, rain = _draw_hour(parameters, rng)
     snow = float(rng.uniform(0.1, 1.0)) if rng.random() < 0.05 else 0.0
-    camera, _ = draw_camera(rng)
+    optics = draw_camera(rng)
     tilt = np.radians(rng.normal([0.0, 1.0, 0.0], [1.2, 2.5, 3.5]))
     # Cameras that look aside or back see poles too; out of town they would mostly see grass.
     if parameters.town and rng.random() < 0.15:
@@ -90,7 +95,7 @@ def draw_variety(rng: np.random.Generator) -> Variety:
     )
     return Variety(
         parameters,
-        camera,
+        optics,
         float(np.exp(rng.uniform(math.log(0.9), math.log(3.0)))),
         (float(tilt[0]), float(tilt[1]), float(tilt[2])),
         float(rng.normal(0.0, 0.4)),
@@ -164,12 +169,11 @@ def _draw_hour(p: SceneParameters, rng: np.random.Generator) -> tuple[Light, Wea
     return light, weather, bool(rain)
 
 
-def draw_camera(rng: np.random.Generator) -> tuple[CameraModel, Optics]:
+def draw_camera(rng: np.random.Generator) -> Optics:
     """A camera of any common size and angle of view whose lens does not fold inside the image."""
     for _ in range(_ATTEMPTS):
-        camera = draw_lens(rng)
         try:
-            return camera, optics_of(camera)
+            return optics_of(draw_lens(rng))
         except InputError:
             continue
     raise InputError("no drawn lens was whole", hint="a narrower range of distortions")
@@ -210,7 +214,8 @@ def picture(variety: Variety, rng: np.random.Generator) -> tuple[Picture, Scene]
         float(place[0]) - (20.0 if ahead > 0.5 else 100.0),
         float(place[0]) + (110.0 if ahead > -0.5 else 20.0),
     )
-    optics = optics_of(variety.camera)
-    shown = render(scene, shadow_map(scene, reach), optics, T_world_cam, time=0.0, look=variety.look, rng=rng)
+    shown = render(
+        scene, shadow_map(scene, reach), variety.optics, T_world_cam, time=0.0, look=variety.look, rng=rng
+    )
     pixels, classes = seen_through(variety.screen, shown.image.pixels, shown.labels, rng)
     return Picture(CameraImage(pixels), classes), scene

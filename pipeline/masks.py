@@ -81,15 +81,10 @@ class MaskParameters:
             the CRF may trim it to its contour, not delete it.
         pole_keep: Least share of a sure pole's pixels, 0..1, that the CRF must leave, or the network's own
             mask stands.
-        lane_peak: Least probability by the network of a patch of paint's surest cell, 0..1. Of the patches
-            below 0.6 a third was paint.
-        pole_peak: Likewise for poles. Of the pieces below 0.4 a quarter was a pole.
-        lane_road: Least mean probability of road around a patch of paint, 0..1: paint lies on a road. Of the
-            patches below 0.3 one in a thousand was paint, even at a frame's lower border.
+        lane_road: Least share of road in what lies around a patch of paint and is no paint, 0..1: paint lies
+            on a road. On training pictures no paint was below 0.4, and an eighth of one dashcam's errors.
         lane_least_px2: Smallest patch of paint, px^2: a dash 3 m long at 30 m under a camera 1.65 m high.
         pole_least_px2: Smallest piece of pole, px^2: 2 px wide, 12 px tall (1 m at 50 m).
-        pole_least_px: Shortest piece of pole, px along its box's diagonal: half a pixel at each end turns the
-            line of a shorter one by more than 3 deg, and but a quarter of them were poles.
         horizon_slack_px: Paint may lie this far above the horizon, px: 2 deg of pitch and slope at 720 px
             focal length.
     """
@@ -101,12 +96,9 @@ class MaskParameters:
     margin_px: float = 2.0
     pole_sure: float = 0.5
     pole_keep: float = 0.5
-    lane_peak: float = 0.6
-    pole_peak: float = 0.4
     lane_road: float = 0.3
     lane_least_px2: float = 12.0
     pole_least_px2: float = 24.0
-    pole_least_px: float = 16.0
     horizon_slack_px: float = 25.0
 
     def __post_init__(self) -> None:
@@ -120,9 +112,9 @@ class MaskParameters:
 
 _SHARES = (
     *("lane_threshold", "pole_threshold", "evidence", "pole_sure", "pole_keep"),
-    *("lane_peak", "pole_peak", "lane_road"),
+    "lane_road",
 )
-_LENGTHS = ("margin_px", "lane_least_px2", "pole_least_px2", "pole_least_px", "horizon_slack_px")
+_LENGTHS = ("margin_px", "lane_least_px2", "pole_least_px2", "horizon_slack_px")
 
 
 def masks_from_probabilities(
@@ -170,7 +162,7 @@ def masks_from_probabilities(
         lane &= _ground_side(horizon, slack, (height, width), (scale_x, scale_y))
     return Masks(
         lane=_lane_pieces(lane, probabilities, parameters, unit),
-        pole=_pole_pieces(pole, probabilities, parameters, unit),
+        pole=_pole_pieces(pole, pole_seen, parameters, unit),
         lane_probability=np.ascontiguousarray(lane_probability),
         pole_probability=np.ascontiguousarray(pole_probability),
         scale_x=scale_x,
@@ -240,33 +232,33 @@ def _deleted_poles(seen: Floats32, left: Bools, parameters: MaskParameters) -> B
     return pieces.where(sure & (pieces.share(left) < parameters.pole_keep))
 
 
-def _pole_pieces(
-    mask: Bools, probabilities: Floats32, parameters: MaskParameters, unit: tuple[float, float]
-) -> Bools:
+def _pole_pieces(mask: Bools, seen: Floats32, parameters: MaskParameters, unit: tuple[float, float]) -> Bools:
+    """The pieces that are large enough and in which the network itself saw a pole."""
     pieces = pieces_of(mask)
-    length = np.hypot(*(pieces.boxes / unit).T)
     return pieces.where(
         (pieces.sizes >= parameters.pole_least_px2 * unit[0] * unit[1])
-        & (length >= parameters.pole_least_px)
-        & (pieces.peaks(probabilities[labels.POLE]) >= parameters.pole_peak)
+        & (pieces.peaks(seen) >= parameters.pole_threshold)
     )
 
 
 _BORDER_PX = 4.0
-"""px of the reference width; what lies so near to paint is its border, half a lane stroke away at 15 m."""
+"""px of the reference width: what lies so near to paint is its border; at least two cells, for the first may
+be paint in part."""
 
 
 def _lane_pieces(
     mask: Bools, probabilities: Floats32, parameters: MaskParameters, unit: tuple[float, float]
 ) -> Bools:
+    """The pieces that are large enough, lie on a road, and in which the network itself saw paint."""
     pieces = pieces_of(mask)
-    reach = max(1, round(_BORDER_PX * unit[0])), max(1, round(_BORDER_PX * unit[1]))
-    road = pieces.around(probabilities[labels.ROAD], reach)
+    reach = max(2, round(_BORDER_PX * unit[0])), max(2, round(_BORDER_PX * unit[1]))
+    seen = probabilities[labels.LANE]
+    road, bare = pieces.around(probabilities[labels.ROAD], reach), 1.0 - pieces.around(seen, reach)
     return pieces.where(
         (pieces.sizes >= parameters.lane_least_px2 * unit[0] * unit[1])
-        & (pieces.peaks(probabilities[labels.LANE]) >= parameters.lane_peak)
-        # Paint that fills the image has no border that could be road.
-        & ~(road < parameters.lane_road)
+        & (pieces.peaks(seen) >= parameters.lane_threshold)
+        # Paint that fills the image has no border that could be road: NaN is not less.
+        & ~(road < parameters.lane_road * bare)
     )
 
 

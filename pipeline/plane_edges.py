@@ -1,6 +1,5 @@
 """Lines of planes: where two of them meet, and where one ends before something further away (PLK V-C)."""
 
-import itertools
 import math
 
 import numpy as np
@@ -15,8 +14,9 @@ MIN_ANGLE = math.radians(25.0)
 """rad between planes that meet: the line between flatter ones is known worse than their noise by 1/sin."""
 MIN_LENGTH_M = 0.5
 """m; shorter edges are details of vehicles and plants."""
-MIN_LENGTH_RAD = 0.03
-"""Length over range, at least: 20 px (PLK V-C) at a focal length of 720 px are 0.028."""
+MIN_LENGTH_RAD = 0.04
+"""Length over range, at least: 20 px (PLK V-C) at a focal length of 720 px are 0.028; a jump between beams
+0.2 deg apart tells a direction to the 2 deg of PLK's merging from 0.04 on."""
 SUPPORT_CELLS = 2.0
 """Sides of a cell from the line within which a plane has points where the line is real."""
 MAX_GAP_CELLS = 3.0
@@ -49,37 +49,59 @@ def creases(planes: list[Plane], cells: Cells, xyz: Floats) -> list[UncertainLin
         xyz: float64 (N,3), its points, m, from the sensor.
     """
     lines = []
-    for first, second in itertools.combinations(planes, 2):
-        direction = np.cross(first.normal, second.normal)
-        sine = float(np.linalg.norm(direction))
-        if sine < math.sin(MIN_ANGLE):
+    for i, j, place, direction in _meetings(planes, xyz):
+        first, second = planes[i], planes[j]
+        parts = (
+            _near(first, second, place, direction, cells, xyz),
+            _near(second, first, place, direction, cells, xyz),
+        )
+        if parts[0] is None or parts[1] is None:
             continue
-        direction = direction / sine
-        place = _common_point(first, second, direction)
-        near = [
-            _near(plane, other, place, direction, cells, xyz)
-            for plane, other in ((first, second), (second, first))
-        ]
-        if any(part is None for part in near):
-            continue
-        parts = [part for part in near if part is not None]
-        step = float(np.median(cells.size[cells.of_point[np.concatenate([p[0] for p in parts])]]))
-        for low, high in _common_runs([p[1] for p in parts], step):
+        along = [parts[0][1], parts[1][1]]
+        points = np.concatenate([parts[0][0], parts[1][0]])
+        step = float(np.median(cells.size[cells.of_point[points]]))
+        for low, high in _common_runs(along, step):
             ends = place + np.array([[low], [high]]) * direction
             if not _long_enough(ends):
                 continue
-            points = np.unique(np.concatenate([i[(s >= low) & (s <= high)] for i, s in parts]))
+            s = np.concatenate(along)
             covariance = _crease_covariance(first, second, direction, ends)
-            lines.append(UncertainLine("crease", ends[0], ends[1], points, covariance))
+            members = np.unique(points[(s >= low) & (s <= high)])
+            lines.append(UncertainLine("crease", ends[0], ends[1], members, covariance))
     return lines
 
 
-def _common_point(first: Plane, second: Plane, direction: Floats) -> Floats:
-    """The point (3,) of both planes that is nearest to the middle between their centres."""
-    middle = 0.5 * (first.centre + second.centre)
-    A = np.stack([first.normal, second.normal, direction])
-    b = [first.normal @ first.centre, second.normal @ second.centre, direction @ middle]
-    return np.asarray(np.linalg.solve(A, np.array(b)))
+def _meetings(planes: list[Plane], xyz: Floats) -> list[tuple[int, int, Floats, Floats]]:
+    """Pairs of planes whose common line passes through both of their neighbourhoods.
+
+    Returns:
+        Their numbers, the point of the line that is nearest to the middle between their centres, and its
+        direction.
+    """
+    if len(planes) < 2:
+        return []
+    normal = np.stack([plane.normal for plane in planes])
+    centre = np.stack([plane.centre for plane in planes])
+    radius = np.array([np.linalg.norm(xyz[p.points] - p.centre, axis=1).max(initial=0.0) for p in planes])
+    i, j = np.triu_indices(len(planes), 1)
+    D = np.cross(normal[i], normal[j])
+    sine = np.linalg.norm(D, axis=1)
+    steep = sine >= math.sin(MIN_ANGLE)
+    i, j, D, sine = i[steep], j[steep], D[steep], sine[steep, None]
+    height = np.einsum("pi,pi->p", normal, centre)[:, None]
+    place = (height[i] * np.cross(normal[j], D) + height[j] * np.cross(D, normal[i])) / sine**2
+    direction = D / sine
+    middle = 0.5 * (centre[i] + centre[j]) - place
+    place = place + np.einsum("pi,pi->p", middle, direction)[:, None] * direction
+    meets = np.ones(len(i), dtype=bool)
+    for k in (i, j):
+        offset = centre[k] - place
+        offset -= np.einsum("pi,pi->p", offset, direction)[:, None] * direction
+        meets &= np.linalg.norm(offset, axis=1) <= radius[k] + MIN_LENGTH_M
+    return [
+        (int(a), int(b), p, d)
+        for a, b, p, d in zip(i[meets], j[meets], place[meets], direction[meets], strict=True)
+    ]
 
 
 def _near(

@@ -192,13 +192,8 @@ class _Smoothness:
         self._taps = _taps(kernel.sigma_x_px, width), _taps(kernel.sigma_y_px, height)
         self._inside = np.flatnonzero(region)
         # The kernel is a product of one along the row and one along the column, and so are its sums.
-        n = np.sqrt(
-            1.0
-            / np.outer(
-                *(_sums(taps, size) for taps, size in zip(self._taps[::-1], region.shape, strict=True))
-            )
-        )
-        n = n.astype(np.float32)
+        along_x, along_y = _sums(self._taps[0], width), _sums(self._taps[1], height)
+        n = np.asarray(1.0 / np.sqrt(np.outer(along_y, along_x)), dtype=np.float32)
         self._before = n.ravel()[self._inside]
         self._after = np.float32(kernel.compat) * self._before
         self._planes = q[:-1].reshape(-1, height, width) * n
@@ -276,8 +271,9 @@ def _sample_outside(region: NDArray[np.bool_], kernel: AppearanceKernel) -> tupl
     near = cv2.boxFilter(
         region.astype(np.float32), -1, (2 * reach[0] + 1, 2 * reach[1] + 1), borderType=cv2.BORDER_CONSTANT
     )
+    height, width = region.shape
     chosen = np.zeros(region.shape, dtype=np.bool_)
-    chosen[step_y // 2 :: step_y, step_x // 2 :: step_x] = True
+    chosen[min(step_y, height) // 2 :: step_y, min(step_x, width) // 2 :: step_x] = True
     chosen &= ~region
     chosen &= near > 0.5 / ((2 * reach[0] + 1) * (2 * reach[1] + 1))
     return np.flatnonzero(chosen), float(step_x * step_y)

@@ -67,9 +67,9 @@ class MaskParameters:
     """How probabilities become masks. All px are px of an image ``REFERENCE_WIDTH_PX`` wide.
 
     Attributes:
-        lane_threshold: Least probability of paint, 0..1, where no CRF takes part. One half: what is more
-            likely paint than anything else together; the largest class alone paints too wide where three
-            classes share a pixel.
+        lane_threshold: Least probability of paint by the network, 0..1: of every pixel of a mask, or where a
+            CRF takes part of one pixel of every piece. One half: what is more likely paint than anything else
+            together; the largest class alone paints too wide where three classes share a pixel.
         pole_threshold: Likewise for poles, whose cells are mostly covered in part: best between 0.2 and 0.4
             on the pictures that the network was trained on.
         crf: The CRFs, or None: the network's probabilities as they are. The common setting for large objects

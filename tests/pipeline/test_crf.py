@@ -215,6 +215,17 @@ class TestRegion:
         # The pixels around matter: without them the answer is another one.
         assert np.abs(alone - exact[:, 8:30, 10:24]).mean() > 2.0 * deviation
 
+    def test_kernel_far_wider_than_the_image(self):
+        unary, image = random_scene(np.random.default_rng(13), 2, 12, 14)
+        region = np.zeros((12, 14), dtype=bool)
+        region[2:5, 3:9] = True
+        wide = CrfParameters(None, AppearanceKernel(200.0, 200.0, (14.0,) * 3, 3.0))
+        got = mean_field(unary, image, wide, region)
+        np.testing.assert_allclose(got.sum(axis=0), 1.0, atol=1e-6)
+        np.testing.assert_array_equal(
+            got[:, ~region], mean_field(unary, image, CrfParameters(None, None))[:, ~region]
+        )
+
     def test_all_pixels_and_none(self):
         unary, image = random_scene(np.random.default_rng(12), 2, 16, 16)
         everywhere = mean_field(unary, image, self.PARAMETERS, np.ones((16, 16), dtype=bool))

@@ -83,7 +83,7 @@ def _stages(name: str, runs: dict[int, Measured]) -> str:
 
 def _ratios(run: Measured) -> str:
     return "\n".join(
-        ["| ratio of process times, one run, one thread | |", "|---|---|"]
+        ["| process times, their ratios and memory, one run, one thread | |", "|---|---|"]
         + [f"| {what} | {value:.2f} |" for what, value in run["ratios"].items()]
     )
 

@@ -81,9 +81,8 @@ def _reference(unary: NDArray[np.float32], pixels: NDArray[np.uint8]) -> NDArray
     crf = dense.DenseCRF2D(width, height, classes)
     crf.setUnaryEnergy(np.ascontiguousarray(unary.reshape(classes, -1)))
     crf.addPairwiseGaussian(sxy=_SMOOTH_PX, compat=_SMOOTH_COMPAT)
-    crf.addPairwiseBilateral(
-        sxy=_LIKE_PX, srgb=_LIKE_GREY, rgbim=np.ascontiguousarray(pixels), compat=_LIKE_COMPAT
-    )
+    # It refuses arrays that it could not write to.
+    crf.addPairwiseBilateral(sxy=_LIKE_PX, srgb=_LIKE_GREY, rgbim=np.array(pixels), compat=_LIKE_COMPAT)
     return np.array(crf.inference(_ITERATIONS), dtype=np.float32).reshape(unary.shape)
 
 

@@ -26,6 +26,9 @@ JUMP_UP_M, JUMP_UP_SHARE = 1.0, 0.10
 """The same between rings, which lie further apart on a slanted surface."""
 GAP_STEPS = 2.6
 """A gap along a ring of more steps breaks it: what lies there was not seen."""
+SKY_STEPS = 5.0
+"""Steps of a gap along a ring from which on it is the sky or a thing that gives no returns: five beams in a
+row are not lost by chance."""
 SPARSEST_RAD = math.radians(0.8)
 """rad; between rings further apart an edge is known to worse than 3 px (10 px over sqrt 12 at f = 720 px)."""
 BEAM_RAD = 0.002
@@ -42,11 +45,16 @@ MIN_COLUMNS = 8
 """Points of an edge along a ring, at least."""
 MOST_EDGES = 8000
 """Edge points of either kind, the nearest first, that are looked at: a street has 2000. Bounds the time."""
-HALF_COMMON = 0.5
-"""Correlation of the errors of both ends from the gaps: 1 where beams form columns and the edge is parallel
-to them, 0 where it crosses many."""
+ACROSS_RINGS = np.array([[1.0, 0.5], [0.5, 1.0]]) / 12.0
+"""Covariance of the errors of both ends of an edge across rings, in gaps: uniform, and common to both where
+the beams form columns and the edge is parallel to them."""
+ALONG_RINGS = np.eye(2) / 6.0
+"""The same of an edge along rings: it slowly crosses from one ring to the next, and a line through one such
+tooth errs by half a gap to opposite sides at its ends: between uniform (1/12) and the worst case (1/4)."""
 _DEPTH_RMS_M = 0.15
 """m; points of an edge scatter less in depth: three times range noise, and the roundness of a body."""
+_FADED = 1e-4
+"""1/m; inverse range of what no sensor sees."""
 _ECHO_RAD = 1e-6
 """rad; points nearer along a ring are echoes of one beam."""
 
@@ -84,10 +92,10 @@ def jump_lines(xyz: Floats, pattern: ScanPattern) -> list[UncertainLine]:
         pattern: Its scan pattern.
     """
     upright = _along_rings(xyz, pattern)
-    lines = _lines(pattern, upright, _linked_across(upright, pattern), MIN_RINGS)
+    lines = _lines(pattern, upright, _linked_across(upright, pattern), MIN_RINGS, ACROSS_RINGS)
     if pattern.ring_spacing <= SPARSEST_RAD:
         level = _between_rings(xyz, pattern)
-        lines += _lines(pattern, level, _linked_along(level, pattern), MIN_COLUMNS)
+        lines += _lines(pattern, level, _linked_along(level, pattern), MIN_COLUMNS, ALONG_RINGS)
     return lines
 
 
@@ -98,7 +106,13 @@ def _goes_on(near: Floats, far: Floats, before: Floats, ratio: Floats) -> Floats
     """
     inverse = 1.0 / near + np.minimum(1.0 / near - 1.0 / before, 0.0) * ratio
     # A plane that runs out of sight before the far beam may be what that beam sees.
-    return np.where(inverse > 1.0 / far, 1.0 / np.maximum(inverse, 1.0 / far), far)
+    return np.where(inverse > 1.0 / far, 1.0 / np.maximum(inverse, _FADED), far)
+
+
+def _ends_there(near: Floats, before: Floats, ratio: Floats) -> NDArray[np.bool_]:
+    """Whether a surface (M,) that gives no further return would have given one: a road only fades away."""
+    on = _goes_on(near, np.full(len(near), np.inf), before, ratio)
+    return on <= near + np.maximum(JUMP_M, JUMP_SHARE * near)
 
 
 def _along_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
@@ -118,21 +132,25 @@ def _along_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
     ratio = gap[edge] / np.maximum(gap[pair], _ECHO_RAD)
     on = _goes_on(r[near], r[far], np.where(known, r[before], r[near]), ratio)
     real = r[far] - on > least[edge]
-    edge, side, near = edge[real], side[real], near[real]
-    half = 0.5 * side * gap[edge]
+    near, side, width = near[real], side[real], gap[edge[real]]
+    # Before the sky, and before what swallows the beam, both points beside the gap are borders.
+    hole = np.flatnonzero((np.diff(pattern.ring) == 0) & (gap >= SKY_STEPS * pattern.azimuth_step))
+    last = np.concatenate([hole, hole + 1])
+    sense = np.repeat(np.array([1, -1]), len(hole))
+    inner = np.clip(last - sense, 0, len(r) - 1)
+    pair = np.clip(np.minimum(last, inner), 0, max(len(gap) - 1, 0))
+    ends = beside[pair] & _ends_there(
+        r[last], r[inner], pattern.azimuth_step / np.maximum(gap[pair], _ECHO_RAD)
+    )
+    near = np.concatenate([near, last[ends]])
+    side = np.concatenate([side, sense[ends]])
+    width = np.concatenate([width, np.full(int(ends.sum()), pattern.azimuth_step)])
+    half = 0.5 * side * width
     x, y, z = xyz[pattern.index[near]].T
     turned = np.column_stack([x * np.cos(half) - y * np.sin(half), x * np.sin(half) + y * np.cos(half), z])
+    azimuth, elevation = pattern.azimuth[near] + half, pattern.elevation[near]
     return _nearest_first(
-        _EdgePoints(
-            near,
-            turned,
-            pattern.ring[near],
-            azimuth[near] + half,
-            pattern.elevation[near],
-            r[near],
-            side,
-            gap[edge],
-        )
+        _EdgePoints(near, turned, pattern.ring[near], azimuth, elevation, r[near], side, width)
     )
 
 
@@ -142,7 +160,7 @@ def _between_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
     r = pattern.distance
     beyond = {upward: _next_ring(pattern, upward) for upward in (1, -1)}
     for upward in (1, -1):
-        far, before = beyond[upward], beyond[-upward]
+        far, before = beyond[upward][0], beyond[-upward][0]
         near = np.flatnonzero((far >= 0) & (before >= 0))
         far, before = far[near], before[near]
         gap = upward * (pattern.elevation[far] - pattern.elevation[near])
@@ -152,23 +170,44 @@ def _between_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
         gap, back = gap[fair], back[fair]
         on = _goes_on(r[near], r[far], r[before], gap / back)
         edge = r[far] - on > np.maximum(JUMP_UP_M, JUMP_UP_SHARE * r[near])
-        near, gap = near[edge], gap[edge]
-        elevation = pattern.elevation[near] + 0.5 * upward * gap
-        x, y = xyz[pattern.index[near], :2].T
-        around = np.arctan2(y, x)
-        position = r[near, None] * np.column_stack(
-            [np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), np.sin(elevation)]
-        )
-        side = np.full(len(near), upward)
-        parts.append(
-            _EdgePoints(
-                near, position, pattern.ring[near], pattern.azimuth[near], elevation, r[near], side, gap
-            )
-        )
+        parts.append(_above(xyz, pattern, near[edge], upward, gap[edge]))
+    # Roofs before the sky: the ring above is there, but not here.
+    level = _ring_elevations(pattern)
+    near = np.flatnonzero(beyond[1][1] & (beyond[-1][0] >= 0))
+    before = beyond[-1][0][near]
+    gap = level[pattern.ring[near] + 1] - pattern.elevation[near]
+    back = pattern.elevation[near] - pattern.elevation[before]
+    fair = (gap > 0.2 * pattern.ring_spacing) & (gap < SPARSEST_RAD) & (back > 0.2 * pattern.ring_spacing)
+    fair[fair] = _ends_there(r[near[fair]], r[before[fair]], gap[fair] / back[fair])
+    parts.append(_above(xyz, pattern, near[fair], 1, gap[fair]))
     joined = _EdgePoints(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in _EdgePoints.__slots__)
     )
     return _nearest_first(joined)
+
+
+def _above(
+    xyz: Floats, pattern: ScanPattern, near: NDArray[np.int64], upward: int, gap: Floats
+) -> _EdgePoints:
+    """Edge points half a gap (M,) above or below the points ``near`` of the pattern."""
+    elevation = pattern.elevation[near] + 0.5 * upward * gap
+    x, y = xyz[pattern.index[near], :2].T
+    around = np.arctan2(y, x)
+    distance = pattern.distance[near]
+    position = distance[:, None] * np.column_stack(
+        [np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), np.sin(elevation)]
+    )
+    side = np.full(len(near), upward)
+    return _EdgePoints(
+        near, position, pattern.ring[near], pattern.azimuth[near], elevation, distance, side, gap
+    )
+
+
+def _ring_elevations(pattern: ScanPattern) -> Floats:
+    """Mean elevation of each ring (R,), NaN for ranks without points."""
+    count = np.bincount(pattern.ring)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.bincount(pattern.ring, weights=pattern.elevation) / count)
 
 
 def _nearest_first(edges: _EdgePoints) -> _EdgePoints:
@@ -186,13 +225,19 @@ _KEY_TURN = 4.0 * math.pi
 """More than a turn, so that rings do not touch in a common key."""
 
 
-def _next_ring(pattern: ScanPattern, upward: int) -> NDArray[np.int64]:
-    """For each point the one beside it on the next ring up or down, -1 for none."""
+def _next_ring(pattern: ScanPattern, upward: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """For each point the one beside it on the next ring up or down, -1 for none.
+
+    Also whether there is such a ring and nothing on it within ``SKY_STEPS``.
+    """
     key = pattern.ring * _KEY_TURN + pattern.azimuth
     wanted = key + upward * _KEY_TURN
-    right = np.clip(np.searchsorted(key, wanted), 1, len(key) - 1)
+    right = np.clip(np.searchsorted(key, wanted), 1, max(len(key) - 1, 1)) % len(key)
     partner = np.where(wanted - key[right - 1] < key[right] - wanted, right - 1, right)
-    return np.where(np.abs(key[partner] - wanted) < 0.6 * pattern.azimuth_step, partner, -1)
+    off = np.abs(key[partner] - wanted)
+    ring = pattern.ring + upward
+    empty = (off >= SKY_STEPS * pattern.azimuth_step) & (ring >= 0) & (ring <= int(pattern.ring.max()))
+    return np.where(off < 0.6 * pattern.azimuth_step, partner, -1), empty
 
 
 def _linked_across(edges: _EdgePoints, pattern: ScanPattern) -> NDArray[np.int64]:
@@ -246,7 +291,7 @@ def _level(edges: _EdgePoints, a: NDArray[np.int64], b: NDArray[np.int64], climb
 
 
 def _lines(
-    pattern: ScanPattern, edges: _EdgePoints, pairs: NDArray[np.int64], least: int
+    pattern: ScanPattern, edges: _EdgePoints, pairs: NDArray[np.int64], least: int, quantum: Floats
 ) -> list[UncertainLine]:
     """Straight lines of the connected groups of edge points."""
     count = len(edges.at)
@@ -257,7 +302,7 @@ def _lines(
     lines = []
     for group in groups:
         parts = _straight_parts(edges, group, least, pattern.azimuth_step)
-        lines += [line for part in parts if (line := _line(edges, part, pattern)) is not None]
+        lines += [line for part in parts if (line := _line(edges, part, pattern, quantum)) is not None]
     return lines
 
 
@@ -296,7 +341,9 @@ def _axis(points: Floats) -> tuple[Floats, Floats, Floats]:
     return mean, direction, np.asarray(centred @ direction)
 
 
-def _line(edges: _EdgePoints, part: NDArray[np.int64], pattern: ScanPattern) -> UncertainLine | None:
+def _line(
+    edges: _EdgePoints, part: NDArray[np.int64], pattern: ScanPattern, quantum: Floats
+) -> UncertainLine | None:
     """The line through a straight part, or None where it is too short or ragged."""
     points = edges.position[part]
     mean, direction, along = _axis(points)
@@ -311,7 +358,7 @@ def _line(edges: _EdgePoints, part: NDArray[np.int64], pattern: ScanPattern) -> 
         return None
     ends = (low, high)
     gap = distance * math.hypot(float(np.sqrt((edges.gap[part] ** 2).mean())), BEAM_RAD)
-    common = gap**2 / 12.0 * np.array([[1.0, HALF_COMMON], [HALF_COMMON, 1.0]])
+    common = gap**2 * quantum
     covariance = np.zeros((4, 4))
     covariance[::2, ::2] = ends_covariance(along, ends, float(rms[0])) + common
     covariance[1::2, 1::2] = ends_covariance(along, ends, float(rms[1])) + COMMON_DEPTH_M**2

@@ -12,6 +12,8 @@ from pipeline.uncertain_lines import UncertainLine, across, ends_covariance
 
 MIN_ANGLE = math.radians(25.0)
 """rad between planes that meet: the line between flatter ones is known worse than their noise by 1/sin."""
+SURFACE_M = 0.01
+"""m, standard deviation at each end of a line; so flat are plastered walls and even roads."""
 MIN_LENGTH_M = 0.5
 """m; shorter edges are details of vehicles and plants."""
 MIN_LENGTH_RAD = 0.04
@@ -162,6 +164,7 @@ def _long_enough(ends: Floats) -> bool:
 def _crease_covariance(first: Plane, second: Plane, direction: Floats, ends: Floats) -> Floats:
     """Covariance (4,4) of both ends across the line, from those of the planes' fits.
 
+    To each end comes what no count of points averages away: walls and roads are not planes.
     With heights e1, e2 of the true planes over the fitted ones, the line moves by N^-1 (e1, e2), N the
     normals in the axes across.
     """
@@ -170,7 +173,7 @@ def _crease_covariance(first: Plane, second: Plane, direction: Floats, ends: Flo
     covariance = np.zeros((4, 4))
     for k, plane in enumerate((first, second)):
         rows = plane.rows(ends)
-        heights = rows @ plane.covariance @ rows.T
+        heights = rows @ plane.covariance @ rows.T + SURFACE_M**2 * np.eye(2)
         covariance += np.kron(heights, np.outer(N_inverse[:, k], N_inverse[:, k]))
     return covariance
 

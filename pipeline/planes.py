@@ -61,6 +61,8 @@ MAX_MERGE_STEP_M = 0.08
 """m; the middle of a plane lies no further from the other one: less than a kerb, more than the noise."""
 MAX_MERGE_GAP_M = 3.0
 """m between two pieces of one plane, as balls around their middles: what stands before a wall is so wide."""
+MAX_TAKEN = 0.5
+"""Share of a plane's points that larger planes have, at most."""
 _PEELS = 6
 """Planes peeled off one region; a car's body has about as many."""
 _BAND_SIGMAS = 3.0
@@ -140,17 +142,18 @@ def find_planes(cells: Cells, xyz: Floats) -> list[Plane]:
     pieces = _merged(cells.position, pieces[: 2 * MOST_PLANES])
     pieces.sort(key=len, reverse=True)
     rough = [_on_plane(cells, xyz, piece) for piece in pieces[:MOST_PLANES]]
+    real, taken = [], np.zeros(len(xyz), dtype=bool)
+    for points in rough:
+        # Cells on the edge of two planes make a small one across it, all of their points.
+        if len(points) and taken[points].mean() <= MAX_TAKEN:
+            real.append(points)
+            taken[points] = True
     shared = np.zeros(len(xyz), dtype=np.int16)
-    for points in rough:
+    for points in real:
         shared[points] += 1
-    planes = []
-    for points in rough:
-        # Near an edge nobody knows on which of two planes a point lies; it would bend both.
-        own = points[shared[points] == 1]
-        plane = _plane(xyz, points, own if 2 * len(own) > len(points) else points)
-        if plane is not None:
-            planes.append(plane)
-    return planes
+    # Near an edge nobody knows on which of two planes a point lies; it would bend both.
+    found = [_plane(xyz, points, points[shared[points] == 1]) for points in real]
+    return [plane for plane in found if plane is not None]
 
 
 def thinned(xyz: Floats, keep: NDArray[np.bool_], spacing: float) -> Cells:

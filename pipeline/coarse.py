@@ -1,8 +1,8 @@
 """The extrinsic of a rig that nobody knows yet, from two lanes and a pole of one frame (CRLF III-C).
 
 All extrinsics that the three lines allow (``pipeline.line_triples``) are ranked by J
-(``pipeline.semantic_cost``). The best few are drawn in by every line that they can match (``pipeline.plk``)
-and ranked again. How far the best stays ahead of a different one is part of the answer.
+(``pipeline.semantic_cost``) above chance. The best few are drawn in by every line that they can match
+(``pipeline.plk``) and ranked again. How far the best stays ahead of a different one is part of the answer.
 """
 
 import math
@@ -55,7 +55,7 @@ class CoarseParameters:
     triples: TripleParameters = field(default_factory=TripleParameters)
     all_lines: int = 16
     points: int = 200
-    finalists: int = 4
+    finalists: int = 6
     distinct_rad: float = math.radians(6.0)
     distinct_m: float = 1.0
 
@@ -72,17 +72,17 @@ class CoarseSolution:
     Attributes:
         T_cam_lidar: float64 (4,4), the best.
         cost: J of it (plateau), over all points.
-        rival_cost: J of the best candidate distinct from it, 0 where there is none: close to ``cost`` the
-            scene is ambiguous.
+        margin: By how much it is ahead of the next distinct candidate, in heights above chance: near 0 the
+            scene is ambiguous; inf where there is no other.
         candidates: float64 (k,4,4), distinct ones, the best first.
-        costs: float64 (k,), J of each.
+        costs: float64 (k,), J of each (plateau). Where many points are out of view a lower J may be better.
         matches: The lines that the best was drawn in by; empty where it stands on its three lines alone.
         tried: Roots that passed as believable.
     """
 
     T_cam_lidar: Floats
     cost: float
-    rival_cost: float
+    margin: float
     candidates: Floats
     costs: Floats
     matches: tuple[LineMatch, ...]
@@ -128,35 +128,56 @@ def coarse_extrinsic(
     if isinstance(found, NoTriples):
         return NoCoarse(found.reason)
     some = SemanticPoints(_spread(points.lane, p.points), _spread(points.pole, p.points))
-    costs = semantic_cost(found.T_cam_lidar, some, maps, camera)
-    if costs.max() <= 0.0:
-        return NoCoarse("no candidate meets the masks")
-    order = np.argsort(-costs, kind="stable")[:_SHORTLIST]
+    scores = semantic_cost(found.T_cam_lidar, some, _above_chance(maps, _SEEK), camera)
+    order = np.argsort(-scores, kind="stable")[:_SHORTLIST]
     apart = order[_distinct(found.T_cam_lidar[order], p)]
     first, others = apart[: p.finalists], apart[p.finalists :]
     frame = _Frame(_longest(cloud_lines, p.all_lines), _longest(image_lines, p.all_lines), camera)
     drawn = [
         _drawn_in(_Fit(found.T_cam_lidar[k], _own_lines(lines, found, int(k), camera)), frame) for k in first
     ]
-    finalists = _kept([_Fit(found.T_cam_lidar[k], _NOTHING) for k in first], drawn, points, maps, camera)
-    final = semantic_cost(np.stack([fit.T_cam_lidar for fit in finalists]), points, maps, camera)
+    chance = _above_chance(maps, _SETTLE)
+    finalists = _kept([_Fit(found.T_cam_lidar[k], _NOTHING) for k in first], drawn, points, chance, camera)
+    final = semantic_cost(np.stack([fit.T_cam_lidar for fit in finalists]), points, chance, camera)
     winner = finalists[int(np.argmax(final))]
     # The lines that the triple's own uncertainty confused are told apart by what the others have added.
-    settled = _kept([winner], [_drawn_in(winner, frame)], points, maps, camera)[0]
+    settled = _kept([winner], [_drawn_in(winner, frame)], points, chance, camera)[0]
     beaten = [fit.T_cam_lidar for fit in finalists if fit is not winner]
     T = np.stack([settled.T_cam_lidar, *beaten, *found.T_cam_lidar[others]])
-    final = semantic_cost(T, points, maps, camera)
-    ranked = np.concatenate([[0], 1 + np.argsort(-final[1:], kind="stable")])
+    final = semantic_cost(T, points, chance, camera)
+    ranked = np.argsort(-final, kind="stable")
     ranked = ranked[_distinct(T[ranked], p)]
+    costs = semantic_cost(T[ranked], points, maps, camera)
+    if costs[0] <= 0.0:
+        return NoCoarse("no candidate meets the masks")
     return CoarseSolution(
-        read_only(T[0]),
-        float(final[0]),
-        float(final[ranked[1]]) if len(ranked) > 1 else 0.0,
+        read_only(T[ranked[0]]),
+        float(costs[0]),
+        float(final[ranked[0]] - final[ranked[1]]) if len(ranked) > 1 else math.inf,
         read_only(T[ranked]),
-        read_only(final[ranked]),
-        settled.used.matches,
+        read_only(costs),
+        settled.used.matches if ranked[0] == 0 else (),
         len(found.T_cam_lidar),
     )
+
+
+_CHANCE = 0.5
+"""Height at which a point in view says nothing; nearer to a mask it speaks for a candidate, further against."""
+_SEEK, _SETTLE = 3, 5
+"""Powers of the heights: points say nothing 11 px or 1 deg beside a mask while triples of noisy lines
+compete, and 7 px after all lines have drawn them in."""
+
+
+def _above_chance(maps: HeightMaps, power: int) -> HeightMaps:
+    """Maps so many times steeper, by which points out of view count as chance and not as misses.
+
+    A LiDAR that turns fully sees the road behind as well. By J itself the best camera is one far behind the
+    vehicle that has all the points in view, near the vanishing point, where with an e-fold of 50 px no mask is
+    far. ``(gamma^d)^n`` is the plateau of ``gamma^n``.
+    """
+    n, chance = np.float32(power), np.float32(_CHANCE)
+    lowered = (heights**n - chance for heights in (maps.lane, maps.pole))
+    return HeightMaps(*lowered, maps.scale_x, maps.scale_y)
 
 
 _SHORTLIST = 256
@@ -234,23 +255,25 @@ _FLOOR = np.array([np.radians(0.1)] * 3 + [0.03] * 3)
 
 
 def _drawn_in(fit: _Fit, frame: _Frame) -> _Fit:
-    """Method I on the pairs of a fit, then on all lines that match under what these leave open."""
-    if len(fit.used.pairs) == 0:
+    """Method I on all lines that match under what the pairs of a fit leave open."""
+    pairs, T, K = fit.used.pairs, fit.T_cam_lidar, frame.camera.K
+    if len(pairs) == 0:
         return fit
-    K = frame.camera.K
-    prior = plk.Prior(fit.T_cam_lidar, np.diag(_WIDEST**-2.0))
-    solution = plk.method_one(fit.used.pairs, K, fit.T_cam_lidar, prior=prior, start_two=False)
-    covariance = np.linalg.inv(solution.information + prior.precision) + np.diag(_FLOOR**2)
-    wider = associate(frame.cloud, frame.image, frame.camera, solution.T_cam_lidar, covariance)
-    if len(wider.pairs) < len(fit.used.pairs):
-        return _Fit(solution.T_cam_lidar, fit.used)
-    solution = plk.method_one(wider.pairs, K, solution.T_cam_lidar, prior=prior, start_two=False)
+    prior = plk.Prior(T, np.diag(_WIDEST**-2.0))
+    J = plk.jacobians(pairs, K, T)
+    information = np.einsum("nki,nkj->ij", J, np.linalg.solve(pairs.covariance, J))
+    posterior = np.linalg.inv(information + prior.precision)
+    covariance = np.asarray(posterior + np.diag(_FLOOR**2), dtype=np.float64)
+    wider = associate(frame.cloud, frame.image, frame.camera, T, covariance)
+    if len(wider.pairs) < len(pairs):
+        return fit
+    solution = plk.method_one(wider.pairs, K, T, prior=prior, start_two=False)
     return _Fit(solution.T_cam_lidar, wider)
 
 
-_ONE_PX = 0.02
-"""Of J: what one px of mean misfit costs one class. The plateau is flat: smaller changes say nothing against
-the lines, larger ones that a wrong pair was among them."""
+_ONE_PX = 0.1
+"""What one px of mean misfit costs one class at the steeper e-fold. The plateau is flat: smaller changes say
+nothing against the lines, larger ones that a wrong pair was among them."""
 
 
 def _kept(

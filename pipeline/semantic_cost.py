@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import se3
-from pipeline.cameras import NEAREST_DEPTH_M, lens_models, lens_of, limit_of
+from pipeline.cameras import NEAREST_DEPTH_M, lens_models, lens_of, limit_of, project
 from pipeline.errors import InputError
 from pipeline.height_maps import Floats32, HeightMaps
 from pipeline.records import CameraModel, CloudLine, Floats, PointCloud, read_only
@@ -52,6 +52,16 @@ def points_of_lines(cloud: PointCloud, lines: Sequence[CloudLine]) -> SemanticPo
         for label in ("lane", "pole")
     )
     return SemanticPoints(cloud.xyz[lane], cloud.xyz[pole])
+
+
+def points_in_view(points: SemanticPoints, camera: CameraModel, T_cam_lidar: Floats) -> SemanticPoints:
+    """The points that project into the image under an extrinsic (4,4), the coarse one say.
+
+    J falls by each point that leaves the image and rises by each that enters it, mask or not: a search over
+    the points all around a LiDAR ends where most of them are in view, so it begins with those that are.
+    """
+    lane, pole = (xyz[project(camera, se3.apply(T_cam_lidar, xyz))[1]] for xyz in (points.lane, points.pole))
+    return SemanticPoints(lane, pole)
 
 
 def semantic_cost(
@@ -106,7 +116,7 @@ def _heights(
     bottom = np.float32(maps.scale_y * camera.height - 0.5)
     seen &= (u >= np.float32(-0.5)) & (u < right) & (v >= np.float32(-0.5)) & (v < bottom)
     found = cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.einsum("sp,sp->s", found, seen, dtype=np.float64)
+    return np.asarray(np.einsum("sp,sp->s", found, seen, dtype=np.float64))
 
 
 def _grid_matrix(maps: HeightMaps, camera: CameraModel) -> Floats:
@@ -251,6 +261,8 @@ class EvolutionParameters:
         population: Extrinsics a generation: five times what six unknowns need, for J has side maxima.
         generations: Per stage, at most.
         least: Width at which a stage ends, in units of the first: 0.006 deg and 1 mm.
+        reach: How far from the start the answer may lie on each axis, in units of the first width: 11 deg and
+            2 m. From far behind all points fall on one pixel, which may well be on a mask.
     """
 
     angle: float = 0.05
@@ -259,6 +271,7 @@ class EvolutionParameters:
     population: int = 48
     generations: int = 60
     least: float = 0.002
+    reach: float = 4.0
 
 
 def evolution_search(
@@ -299,8 +312,9 @@ def evolution_search(
         for _ in range(parameters.generations):
             values, axes = np.linalg.eigh(state.shape)
             steps = rng.normal(size=(parameters.population, 6)) * np.sqrt(np.maximum(values, 0.0)) @ axes.T
-            trials = _retracted(T_start, unit * (state.mean + state.width * steps))
-            costs = semantic_cost(trials, points, heights, camera)
+            places = state.mean + state.width * steps
+            costs = semantic_cost(_retracted(T_start, unit * places), points, heights, camera)
+            costs -= np.maximum(np.abs(places) - parameters.reach, 0.0).sum(axis=1)
             evaluations += len(costs)
             state = _next_generation(state, steps[np.argsort(-costs)], (values, axes))
             if state.width * np.sqrt(float(values[-1])) < parameters.least:

@@ -162,7 +162,7 @@ def coarse_extrinsic(
 
 
 _CHANCE = 0.5
-"""Height at which a point in view says nothing; nearer to a mask it speaks for a candidate, further against."""
+"""Height at which a point in view says nothing; nearer to a mask it speaks for a candidate, else against."""
 _SEEK, _SETTLE = 3, 5
 """Powers of the heights: points say nothing 11 px or 1 deg beside a mask while triples of noisy lines
 compete, and 7 px after all lines have drawn them in."""
@@ -172,12 +172,14 @@ def _above_chance(maps: HeightMaps, power: int) -> HeightMaps:
     """Maps so many times steeper, by which points out of view count as chance and not as misses.
 
     A LiDAR that turns fully sees the road behind as well. By J itself the best camera is one far behind the
-    vehicle that has all the points in view, near the vanishing point, where with an e-fold of 50 px no mask is
+    vehicle that has all points in view, near the vanishing point, where with an e-fold of 50 px no mask is
     far. ``(gamma^d)^n`` is the plateau of ``gamma^n``.
     """
-    n, chance = np.float32(power), np.float32(_CHANCE)
-    lowered = (heights**n - chance for heights in (maps.lane, maps.pole))
-    return HeightMaps(*lowered, maps.scale_x, maps.scale_y)
+    lane, pole = (
+        np.asarray(heights ** np.float32(power) - np.float32(_CHANCE), dtype=np.float32)
+        for heights in (maps.lane, maps.pole)
+    )
+    return HeightMaps(lane, pole, maps.scale_x, maps.scale_y)
 
 
 _SHORTLIST = 256

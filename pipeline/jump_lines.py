@@ -51,8 +51,14 @@ the beams form columns and the edge is parallel to them."""
 ALONG_RINGS = np.eye(2) / 6.0
 """The same of an edge along rings: it slowly crosses from one ring to the next, and a line through one such
 tooth errs by half a gap to opposite sides at its ends: between uniform (1/12) and the worst case (1/4)."""
-_DEPTH_RMS_M = 0.15
+_DEPTH_RMS_M = 0.08
 """m; points of an edge scatter less in depth: three times range noise, and the roundness of a body."""
+_MAX_DEPTH_M = 0.3
+"""m; a point further from the line in depth bends it."""
+_SIDE_RMS_GAPS = 0.45
+"""Gaps; points of an edge scatter less sideways: uniform over a gap have 0.29, leaves more."""
+_FILLED = 0.7
+"""Share of the rings (of an edge along rings: of the columns) between its ends on which an edge shows."""
 _FADED = 1e-4
 """1/m; inverse range of what no sensor sees."""
 _ECHO_RAD = 1e-6
@@ -115,6 +121,11 @@ def _ends_there(near: Floats, before: Floats, ratio: Floats) -> NDArray[np.bool_
     return on <= near + np.maximum(JUMP_M, JUMP_SHARE * near)
 
 
+def _one_body(near: Floats, before: Floats) -> NDArray[np.bool_]:
+    """Whether two neighbours (M,) lie on one surface: a leaf has no neighbour, a body has."""
+    return np.asarray(np.abs(near - before) <= STEP_M + STEP_SHARE * near)
+
+
 def _along_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
     """Jumps between neighbours on a ring, at the azimuth between them."""
     r, azimuth = pattern.distance, pattern.azimuth
@@ -131,7 +142,11 @@ def _along_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
     known = beside[pair] & (pair != edge)
     ratio = gap[edge] / np.maximum(gap[pair], _ECHO_RAD)
     on = _goes_on(r[near], r[far], np.where(known, r[before], r[near]), ratio)
-    real = r[far] - on > least[edge]
+    real = (r[far] - on > least[edge]) & known & _one_body(r[near], r[before])
+    # What is seen beside a body goes on for a beam or two; between leaves it comes and goes.
+    farther = np.clip(far + side, 0, len(r) - 1)
+    on_ring = pattern.ring[farther] == pattern.ring[near]
+    real &= ~on_ring | (r[farther] - r[near] > 0.5 * least[edge])
     near, side, width = near[real], side[real], gap[edge[real]]
     # Before the sky, and before what swallows the beam, both points beside the gap are borders.
     hole = np.flatnonzero((np.diff(pattern.ring) == 0) & (gap >= SKY_STEPS * pattern.azimuth_step))
@@ -139,9 +154,8 @@ def _along_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
     sense = np.repeat(np.array([1, -1]), len(hole))
     inner = np.clip(last - sense, 0, len(r) - 1)
     pair = np.clip(np.minimum(last, inner), 0, max(len(gap) - 1, 0))
-    ends = beside[pair] & _ends_there(
-        r[last], r[inner], pattern.azimuth_step / np.maximum(gap[pair], _ECHO_RAD)
-    )
+    ends = beside[pair] & _one_body(r[last], r[inner])
+    ends &= _ends_there(r[last], r[inner], pattern.azimuth_step / np.maximum(gap[pair], _ECHO_RAD))
     near = np.concatenate([near, last[ends]])
     side = np.concatenate([side, sense[ends]])
     width = np.concatenate([width, np.full(int(ends.sum()), pattern.azimuth_step)])
@@ -170,6 +184,7 @@ def _between_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
         gap, back = gap[fair], back[fair]
         on = _goes_on(r[near], r[far], r[before], gap / back)
         edge = r[far] - on > np.maximum(JUMP_UP_M, JUMP_UP_SHARE * r[near])
+        edge &= _one_body(r[near], r[before])
         parts.append(_above(xyz, pattern, near[edge], upward, gap[edge]))
     # Roofs before the sky: the ring above is there, but not here.
     level = _ring_elevations(pattern)
@@ -178,6 +193,7 @@ def _between_rings(xyz: Floats, pattern: ScanPattern) -> _EdgePoints:
     gap = level[pattern.ring[near] + 1] - pattern.elevation[near]
     back = pattern.elevation[near] - pattern.elevation[before]
     fair = (gap > 0.2 * pattern.ring_spacing) & (gap < SPARSEST_RAD) & (back > 0.2 * pattern.ring_spacing)
+    fair &= _one_body(r[near], r[before])
     fair[fair] = _ends_there(r[near[fair]], r[before[fair]], gap[fair] / back[fair])
     parts.append(_above(xyz, pattern, near[fair], 1, gap[fair]))
     joined = _EdgePoints(
@@ -318,7 +334,7 @@ def _straight_parts(
         mean, direction, along = _axis(edges.position[chain])
         sideways, depth = ((edges.position[chain] - mean) @ across(direction, mean).T).T
         allowed = edges.distance[chain] * (0.75 * np.maximum(edges.gap[chain], step) + BEAM_RAD)
-        excess = np.maximum(np.abs(sideways) / allowed, np.abs(depth) / (3.0 * _DEPTH_RMS_M))
+        excess = np.maximum(np.abs(sideways) / allowed, np.abs(depth) / (_MAX_DEPTH_M))
         if excess.max() <= 1.0:
             parts.append(chain)
             continue
@@ -341,6 +357,16 @@ def _axis(points: Floats) -> tuple[Floats, Floats, Floats]:
     return mean, direction, np.asarray(centred @ direction)
 
 
+def _filled(edges: _EdgePoints, part: NDArray[np.int64], pattern: ScanPattern) -> bool:
+    """Whether an edge shows on nearly every ring between its ends, or else in every column."""
+    rings = np.unique(edges.ring[part])
+    columns = np.unique(np.rint(edges.azimuth[part] / pattern.azimuth_step))
+    return bool(
+        len(rings) >= max(MIN_RINGS, _FILLED * (rings[-1] - rings[0] + 1))
+        or len(columns) >= max(MIN_COLUMNS, _FILLED * (columns[-1] - columns[0] + 1))
+    )
+
+
 def _line(
     edges: _EdgePoints, part: NDArray[np.int64], pattern: ScanPattern, quantum: Floats
 ) -> UncertainLine | None:
@@ -354,10 +380,10 @@ def _line(
     sideways, depth = ((points - mean) @ across(direction, mean).T).T
     freedom = max(len(part) - 2, 1)
     rms = np.sqrt(np.array([sideways @ sideways, depth @ depth]) / freedom)
-    if rms[1] > _DEPTH_RMS_M:
+    gap = distance * math.hypot(float(np.sqrt((edges.gap[part] ** 2).mean())), BEAM_RAD)
+    if rms[1] > _DEPTH_RMS_M or rms[0] > _SIDE_RMS_GAPS * gap or not _filled(edges, part, pattern):
         return None
     ends = (low, high)
-    gap = distance * math.hypot(float(np.sqrt((edges.gap[part] ** 2).mean())), BEAM_RAD)
     common = gap**2 * quantum
     covariance = np.zeros((4, 4))
     covariance[::2, ::2] = ends_covariance(along, ends, float(rms[0])) + common

@@ -285,7 +285,7 @@ def _border_line(
     inside = np.zeros(len(cells.position) + 1, dtype=bool)
     inside[edge] = True
     index = plane.points[inside[cells.of_point[plane.points]]]
-    along, reach = (xyz[index] - rough.mean(axis=0)) @ np.stack([span, out]).T
+    along, reach = np.stack([span, out]) @ (xyz[index] - rough.mean(axis=0)).T
     outermost = np.lexsort((-reach, np.floor(along / step)))
     outermost = outermost[np.unique(np.floor(along / step)[outermost], return_index=True)[1]]
     if len(outermost) < MIN_BORDER_CELLS:

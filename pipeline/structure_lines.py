@@ -20,6 +20,8 @@ from pipeline.uncertain_lines import UncertainLine, structure_line
 
 MOST_POINTS = 200_000
 """Points of a sweep that take part; more are thinned evenly first. A sweep of 128 rings in a wide view."""
+OUTERMOST_M = 1e4
+"""m; coordinates beyond are no measurement, and neither is what is not a number."""
 MOST_LINES = 80
 """Lines given, those longest for their uncertainty: matching costs the product with the image's lines."""
 SAME_ANGLE = math.radians(3.0)
@@ -51,13 +53,18 @@ def find_structure_lines(
     """
     shift = np.zeros(3) if origin is None else origin
     with np.errstate(invalid="ignore"):
-        xyz = cloud.xyz.astype(np.float64) - shift
-    keep = seen & np.isfinite(xyz).all(axis=1)
+        sound = (np.abs(cloud.xyz) < OUTERMOST_M).all(axis=1)
+    if not sound.all():
+        index = np.flatnonzero(sound)
+        ring = None if cloud.ring is None else cloud.ring[index]
+        found = find_structure_lines(PointCloud(cloud.xyz[index], None, ring), seen[index], rng, origin)
+        return [dataclasses.replace(line, points=index[line.points]) for line in found]
+    xyz = cloud.xyz.astype(np.float64) - shift
+    keep = seen
     if keep.sum() > MOST_POINTS:
         chosen = np.flatnonzero(keep)
         keep = np.zeros(len(keep), dtype=bool)
         keep[chosen[:: math.ceil(len(chosen) / MOST_POINTS)]] = True
-    xyz[~keep] = 0.0
     turn, pattern = _pattern(cloud, xyz, keep)
     spacing = DEFAULT_SPACING_RAD if pattern is None else max(pattern.ring_spacing, pattern.azimuth_step)
     cells = thinned(xyz, keep, spacing)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import plk
-from pipeline.association import NO_PAIRS, Association, associate, pairs_on_overlap
+from pipeline.association import Association, associate, pairs_on_overlap
 from pipeline.errors import InputError
 from pipeline.height_maps import HeightMaps
 from pipeline.line_triples import (
@@ -76,7 +76,7 @@ class CoarseSolution:
             scene is ambiguous; inf where there is no other.
         candidates: float64 (k,4,4), distinct ones, the best first.
         costs: float64 (k,), J of each (plateau). Where many points are out of view a lower J may be better.
-        matches: The lines that the best was drawn in by; empty where it stands on its three lines alone.
+        matches: The lines that the best rests on: its own three at least, unless they share too little.
         tried: Roots that passed as believable.
     """
 
@@ -130,20 +130,16 @@ def coarse_extrinsic(
     some = SemanticPoints(_spread(points.lane, p.points), _spread(points.pole, p.points))
     scores = semantic_cost(found.T_cam_lidar, some, _above_chance(maps, _SEEK), camera)
     order = np.argsort(-scores, kind="stable")[:_SHORTLIST]
-    apart = order[_distinct(found.T_cam_lidar[order], p)]
-    first, others = apart[: p.finalists], apart[p.finalists :]
+    apart = order[_distinct(found.T_cam_lidar[order], p)][: _RIVALS * p.finalists]
     frame = _Frame(_longest(cloud_lines, p.all_lines), _longest(image_lines, p.all_lines), camera)
-    drawn = [
-        _drawn_in(_Fit(found.T_cam_lidar[k], _own_lines(lines, found, int(k), camera)), frame) for k in first
-    ]
+    fits = [_Fit(found.T_cam_lidar[k], _own_lines(lines, found, int(k), camera)) for k in apart]
     chance = _above_chance(maps, _SETTLE)
-    finalists = _kept([_Fit(found.T_cam_lidar[k], _NOTHING) for k in first], drawn, points, chance, camera)
-    final = semantic_cost(np.stack([fit.T_cam_lidar for fit in finalists]), points, chance, camera)
-    winner = finalists[int(np.argmax(final))]
+    drawn = [_drawn_in(fit, frame) for fit in fits[: p.finalists]]
+    fits = [*_kept(fits[: p.finalists], drawn, points, chance, camera), *fits[p.finalists :]]
+    best = int(np.argmax(semantic_cost(_extrinsics(fits), points, chance, camera)))
     # The lines that the triple's own uncertainty confused are told apart by what the others have added.
-    settled = _kept([winner], [_drawn_in(winner, frame)], points, chance, camera)[0]
-    beaten = [fit.T_cam_lidar for fit in finalists if fit is not winner]
-    T = np.stack([settled.T_cam_lidar, *beaten, *found.T_cam_lidar[others]])
+    fits[best] = _kept([fits[best]], [_drawn_in(fits[best], frame)], points, chance, camera)[0]
+    T = _extrinsics(fits)
     final = semantic_cost(T, points, chance, camera)
     ranked = np.argsort(-final, kind="stable")
     ranked = ranked[_distinct(T[ranked], p)]
@@ -156,7 +152,7 @@ def coarse_extrinsic(
         float(final[ranked[0]] - final[ranked[1]]) if len(ranked) > 1 else math.inf,
         read_only(T[ranked]),
         read_only(costs),
-        settled.used.matches if ranked[0] == 0 else (),
+        fits[ranked[0]].used.matches,
         len(found.T_cam_lidar),
     )
 
@@ -182,6 +178,8 @@ def _above_chance(maps: HeightMaps, power: int) -> HeightMaps:
     return HeightMaps(lane, pole, maps.scale_x, maps.scale_y)
 
 
+_RIVALS = 2
+"""Times the finalists are compared in the end: those that were not drawn in may still be rivals."""
 _SHORTLIST = 256
 """Best candidates among which distinct ones are sought: dozens of triples show the same extrinsic."""
 
@@ -236,7 +234,9 @@ class _Fit:
     used: Association
 
 
-_NOTHING = Association((), NO_PAIRS)
+def _extrinsics(fits: Sequence[_Fit]) -> Floats:
+    """T_cam_lidar of fits, (N,4,4)."""
+    return np.stack([fit.T_cam_lidar for fit in fits])
 
 
 def _own_lines(lines: Lines, found: Triples, k: int, camera: CameraModel) -> Association:
@@ -286,8 +286,8 @@ def _kept(
     camera: CameraModel,
 ) -> list[_Fit]:
     """Of each fit what the lines made of it, unless it lost by J."""
-    T = np.stack([fit.T_cam_lidar for fit in (*before, *after)])
-    old, new = np.split(semantic_cost(T, points, maps, camera), 2)
+    scores = semantic_cost(_extrinsics([*before, *after]), points, maps, camera)
+    old, new = np.split(scores, 2)
     return [
         b if lost else a for a, b, lost in zip(after, before, (new < old - _ONE_PX).tolist(), strict=True)
     ]

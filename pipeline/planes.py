@@ -9,6 +9,7 @@ of the frame, no rings and no order of points is used.
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scipy.spatial import cKDTree
 from pipeline.ground import plane_basis
 from pipeline.records import Floats, read_only
 
-Indices = NDArray[np.int64]
+Indices: TypeAlias = NDArray[np.int64]
 
 DEFAULT_SPACING_RAD = 0.01
 """rad; angle between neighbouring beams where the cloud does not tell: between 64 and 32 rings."""

@@ -1,14 +1,22 @@
 import dataclasses
+import json
 import math
+import os
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pipeline import se3
+from pipeline.image_segments import find_image_segments
+from pipeline.line_witness import in_view
 from pipeline.plane_edges import SURFACE_M
-from pipeline.records import PointCloud
+from pipeline.records import CameraImage, CameraModel, PointCloud
 from pipeline.structure_lines import MOST_LINES, cloud_lines, find_structure_lines
 
+DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 HEIGHT_M, SIGMA_M = 1.8, 0.02
 
 
@@ -308,3 +316,62 @@ def test_records_keep_the_covariance_and_the_class():
         arm = np.array([0.0, line.length]) - record.mean_m
         variance = record.sigma_m**2 * (1.0 / len(record.points) + np.outer(arm, arm) / record.spread)
         np.testing.assert_allclose(variance, line.sideways, rtol=1e-4, atol=1e-9)
+
+
+def shown(lines, segments, camera, T):
+    """Lines in view, and those of them along half of which an image line lies, within 3 px and 2 deg."""
+    unit = max(1.0, camera.K[1, 1] / 720.0)
+    ends = np.array([[segment.start, segment.end] for segment in segments])
+    span = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(span, axis=1)
+    span /= length[:, None]
+    hits, count = 0, 0
+    for line in lines:
+        p = np.stack([line.start, line.end]) @ T[:3, :3].T + T[:3, 3]
+        if p[:, 2].min() < 1.0:
+            continue
+        a, b = (p @ camera.K.T)[:, :2] / p[:, 2:]
+        places = a + np.linspace(0.025, 0.975, 20)[:, None] * (b - a)
+        inside = ((places >= 0) & (places < [camera.width, camera.height])).all(axis=1)
+        if inside.mean() < 0.7:
+            continue
+        count += 1
+        e = (b - a) / np.linalg.norm(b - a)
+        alike = np.abs(e[0] * span[:, 1] - e[1] * span[:, 0]) < math.sin(math.radians(2.0))
+        offset = places[:, None] - ends[None, alike, 0]
+        along = np.einsum("psi,si->ps", offset, span[alike])
+        across = np.abs(offset[..., 0] * span[alike, 1] - offset[..., 1] * span[alike, 0])
+        on = (across < 3.0 * unit) & (along > -2.0 * unit) & (along < length[alike] + 2.0 * unit)
+        hits += on.mean(axis=0).max(initial=0.0) >= 0.5
+    return hits, count
+
+
+@pytest.mark.recordings
+def test_the_image_shows_the_lines_of_real_frames_and_not_those_of_a_turned_mount():
+    """The published extrinsics are good to 0.1 to 0.2 deg."""
+    folders = [DATA / "kitti_singles" / f"{k:06d}" for k in (1, 5, 6, 9, 11, 12)]
+    folders = [folder for folder in folders if (folder / "calib.json").is_file()]
+    if not folders:
+        pytest.skip(f"no recordings in {DATA}")
+    hits, count = np.zeros(3), np.zeros(3)
+    for folder in folders:
+        calib = json.loads((folder / "calib.json").read_text())
+        pixels = cv2.imread(str(folder / "image.png"))
+        K = np.array(calib["camera"]["K"], dtype=float).reshape(3, 3)
+        camera = CameraModel("pinhole", K, np.zeros(0), pixels.shape[1], pixels.shape[0])
+        xyz = np.fromfile(folder / "cloud.bin", np.float32).reshape(-1, 4)[:, :3]
+        cloud, T = PointCloud(np.ascontiguousarray(xyz)), np.array(calib["T_cam_lidar"])
+        lines = lines_of(cloud, in_view(cloud, camera, T))
+        segments = find_image_segments(CameraImage(pixels), camera)
+        for k, degrees in enumerate((0.0, 1.0, 2.0)):
+            for axis in range(3):
+                for sign in (1, -1):
+                    xi = sign * math.radians(degrees) * np.eye(6)[axis]
+                    found = shown(lines, segments, camera, se3.retract(T, xi))
+                    hits[k] += found[0]
+                    count[k] += found[1]
+    share = hits / count
+    assert count[0] > 25 * 6
+    assert share[0] > 0.2
+    assert share[1] < 0.75 * share[0]
+    assert share[2] < 0.55 * share[0]

@@ -313,8 +313,9 @@ def _lines(
     count = len(edges.at)
     graph = coo_array((np.ones(pairs.shape[1], dtype=np.int8), (pairs[0], pairs[1])), shape=(count, count))
     label = connected_components(graph, directed=False)[1]
-    order = np.argsort(label, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if count else []
+    members = np.flatnonzero(np.bincount(label, minlength=1)[label] >= least)
+    order: NDArray[np.int64] = members[np.argsort(label[members], kind="stable")]
+    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
     lines = []
     for group in groups:
         parts = _straight_parts(edges, group, least, pattern.azimuth_step)

@@ -30,7 +30,7 @@ FARTHEST_M = 80.0
 """m; beyond, walls have a handful of points."""
 LEAST_CELL_M = 0.1
 """m; cells are not smaller: five times the noise of a range, so that a cell's plane is not made of it."""
-MOST_CELLS = 12_000
+MOST_CELLS = 6_000
 """Cells looked at, which bounds the time; a denser cloud gets larger cells until it fits."""
 MOST_PLANES = 40
 """Planes kept, those of most cells: a street shows ten to thirty. Bounds the time."""

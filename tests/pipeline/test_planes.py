@@ -38,7 +38,8 @@ def test_the_walls_of_a_room():
     for plane in planes:
         own = np.bincount(wall[plane.points], minlength=3)
         axis = int(own.argmax())
-        assert own[axis] > 0.97 * own.sum()
+        # The band of a plane holds a strip of 6 cm of each of the others, which are 3 and 4 m wide.
+        assert own[axis] > 0.96 * own.sum()
         assert own[axis] > 0.95 * (wall == axis).sum()
         assert abs(plane.normal[axis]) > math.cos(math.radians(0.2))
         assert plane.sigma_m == pytest.approx(0.02, rel=0.06)

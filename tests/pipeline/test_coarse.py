@@ -86,7 +86,7 @@ def test_roads_with_two_lanes_and_a_pole_are_solved_without_a_prior():
     """At 1 px and 3 cm: within 3 deg and 0.5 m, from any frame of the LiDAR and any order of the lines."""
     rng = np.random.default_rng(1)
     good, fine = [], []
-    for seed in range(60):
+    for seed in range(36):
         made = make(2000 + seed, lanes=int(rng.integers(2, 5)), poles=int(rng.integers(1, 6)))
         labels = [line.label for line in made.image]
         if labels.count("lane") < 2 or "pole" not in labels:
@@ -100,7 +100,7 @@ def test_roads_with_two_lanes_and_a_pole_are_solved_without_a_prior():
         good.append(angle < 3.0 and shift < 0.5)
         if labels.count("lane") >= 3 and labels.count("pole") >= 2:
             fine.append((angle, shift))
-    assert len(good) >= 50
+    assert len(good) >= 30
     assert np.mean(good) >= 0.95
     # With lines to spare all of them take part: no single triple is so sharp.
     assert np.median(fine, axis=0)[0] < 0.3

@@ -99,18 +99,30 @@ def _read(path: Path, check: Callable[[object], _T]) -> _T:
         raise DataError(f"{path}: {error}") from error
 
 
-def read_sets(roots: list[Path]) -> list[LabelledSet]:
-    """Read every set below the given folders, in the order of their names.
+def read_sets(roots: list[Path], only: frozenset[str] = frozenset()) -> list[LabelledSet]:
+    """Read the sets below the given folders, in the order of their names.
+
+    Args:
+        roots: Folders of sets.
+        only: Names of the sets that are wanted; empty: all.
 
     Raises:
-        DataError: If there is none, or a ``classes.json`` names other classes than the label contract.
+        DataError: If there is none, a wanted one is missing, or a ``classes.json`` names other classes than
+            the label contract.
     """
     found: list[LabelledSet] = []
     for root in roots:
         contract = root / "classes.json"
         if contract.is_file():
             _read(contract, labels.check_class_names)
-        found += [read_set(path.parent) for path in sorted(root.glob("*/set.json"))]
+        found += [
+            read_set(path.parent)
+            for path in sorted(root.glob("*/set.json"))
+            if not only or path.parent.name in only
+        ]
+    missing = only - {one.folder.name for one in found}
+    if missing:
+        raise DataError(f"no set {', '.join(sorted(missing))} below {', '.join(map(str, roots))}")
     if not found:
         raise DataError(f"no */set.json below {', '.join(map(str, roots))}")
     return found

@@ -193,6 +193,9 @@ def main() -> None:
     parser.add_argument(
         "--data", type=Path, action="append", required=True, help="folder of sets; may be repeated"
     )
+    parser.add_argument(
+        "--set", dest="sets", action="append", default=[], metavar="SET", help="train on these sets only"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the log")
     parser.add_argument(
         "--minutes", type=float, required=True, help="time to spend in all, earlier runs counted in"
@@ -213,7 +216,7 @@ def main() -> None:
     cv2.setNumThreads(options.threads)
     torch.manual_seed(options.seed)
     recipe = Recipe()
-    sets = read_sets(options.data)
+    sets = read_sets(options.data, frozenset(options.sets))
     run = start(recipe, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
     if (options.out / CHECKPOINT).is_file():
         run.load(options.out / CHECKPOINT)

@@ -11,20 +11,21 @@ from pipeline.segmentation import STRIDE, Segmenter
 DEFAULT_NAME = "bisenetv2.onnx"
 """Package data of ``models``; nothing is imported from there."""
 
+FREE_NAME = "bisenetv2_free.onnx"
+"""Likewise, trained on pictures without non-commercial terms only; asked for by the word ``FREE``."""
+
+FREE = Path("free")
+
 _LARGEST_BYTES = 256 << 20
 """A network for two cores has megabytes; more is another kind of file."""
 
 
 def model_bytes(path: Path | None) -> bytes:
-    """The bytes of the network at ``path``, or of the one that ships; ModelError says what is missing."""
+    """The bytes of the network at ``path``, or of one that ships; ModelError says what is missing."""
     if path is None:
-        packaged = resources.files("models").joinpath(DEFAULT_NAME)
-        if not packaged.is_file():
-            raise ModelError(
-                f"the network {DEFAULT_NAME} is missing from this installation",
-                hint="install calibwatch anew, or name a model with --model FILE",
-            )
-        return packaged.read_bytes()
+        return _packaged(DEFAULT_NAME)
+    if path == FREE and not path.exists():
+        return _packaged(FREE_NAME)
     try:
         size = path.stat().st_size
         if size > _LARGEST_BYTES:
@@ -38,11 +39,21 @@ def model_bytes(path: Path | None) -> bytes:
         ) from error
 
 
+def _packaged(name: str) -> bytes:
+    packaged = resources.files("models").joinpath(name)
+    if not packaged.is_file():
+        raise ModelError(
+            f"the network {name} is missing from this installation",
+            hint="install calibwatch anew, or name a model with --model FILE",
+        )
+    return packaged.read_bytes()
+
+
 def open_segmenter(path: Path | None, threads: int) -> Segmenter:
     """A session of the network at ``path``, or of the one that ships.
 
     Args:
-        path: The .onnx file, or None.
+        path: The .onnx file, ``FREE``, or None.
         threads: Threads that one call may use.
 
     Raises:

@@ -58,7 +58,8 @@ def model_option(function: Callable[..., object]) -> Callable[..., object]:
     return click.option(
         "--model",
         type=click.Path(path_type=Path),
-        help="Segmentation network (.onnx); default: the one that ships.",
+        help="Segmentation network (.onnx), or 'free': the one that ships whose data allow commercial use; "
+        "default: the other one that ships.",
     )(function)
 
 

@@ -171,3 +171,11 @@ def test_synthetic_marks_are_drawn_where_road_is_known(tmp_path):
     lane, pole = shares(paint_share=0.0, pole_share=1.0)
     assert lane == 0.0
     assert pole > 0.5
+
+
+def test_only_the_sets_that_are_asked_for_are_read(tmp_path):
+    for name in ("a", "b", "c"):
+        write_set(tmp_path / name)
+    assert [one.folder.name for one in read_sets([tmp_path], frozenset({"c", "a"}))] == ["a", "c"]
+    with pytest.raises(DataError, match="no set fog below"):
+        read_sets([tmp_path], frozenset({"a", "fog"}))

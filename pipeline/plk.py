@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from pipeline import se3
 from pipeline.records import Floats
@@ -32,6 +33,9 @@ _NULL = 1e-9
 
 _NO_FREEDOM = 1e-6
 """Degrees of freedom; what is left by rounding."""
+
+_BY_CHANCE = 1e-3
+"""Chance that planes with a common ray seem to have none; their answer is then judged by its cost alone."""
 
 _MAX_DAMPING = 1e6
 """Likewise: a step so small that does not lower the cost is rounding."""
@@ -192,9 +196,21 @@ def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
     """
     if len(pairs) < 3:
         return None
+    R = rotation_from_directions(pairs, K, T_start)
+    if R is None:
+        return None
+    t = translation_from_planes(pairs, K, R, T_start)
+    return None if t is None else se3.transform(R, t)
+
+
+def rotation_from_directions(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
+    """Stage 1 of method II: rotation (3,3) by the weighted sines ``n'^T R v`` (FORMULAS C (10)-(13), C7).
+
+    None where the directions leave a freedom: parallel lines, or fewer than three.
+    """
     normal = plane_normals(pairs, K)
     _, v = plucker(pairs.start, pairs.end)
-    sigma_sine, sigma_offset = _stage_sigmas(pairs, K, T_start)
+    sigma_sine, _ = _stage_sigmas(pairs, K, T_start)
     R = T_start[:3, :3]
     for _ in range(_MAX_STEPS):
         v_cam = v @ R.T
@@ -210,13 +226,39 @@ def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
         R = se3.exp_so3(phi) @ R
         if np.abs(phi).max() < _CONVERGED:
             break
+    return se3.orthonormalised(R)
+
+
+def translation_from_planes(pairs: LinePairs, K: Floats, R: Floats, T_start: Floats) -> Floats | None:
+    """Stage 2 of method II: translation (3,) by ``n'.t = -n'.(R p_m)`` (FORMULAS C (14), scalar form).
+
+    The weights are taken at ``T_start``. None where the planes leave a freedom: all share a ray, as far as
+    the noise of the image tells.
+    """
+    normal = plane_normals(pairs, K)
+    _, sigma_offset = _stage_sigmas(pairs, K, T_start)
     A = normal / sigma_offset[:, None]
-    if np.linalg.matrix_rank(A, tol=1e-9 * float(np.linalg.norm(A))) < 3:
+    if _share_a_ray(pairs, K, np.linalg.svd(A)[2][2]):
         return None
     middle = 0.5 * (pairs.start + pairs.end) @ R.T
     b = -np.einsum("ni,ni->n", normal, middle) / sigma_offset
-    t = np.linalg.lstsq(A, b, rcond=None)[0]
-    return se3.transform(se3.orthonormalised(R), t)
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+
+
+def _share_a_ray(pairs: LinePairs, K: Floats, ray: Floats) -> bool:
+    """Whether the distances of ``ray`` (3,) from all planes may be noise of the image lines.
+
+    Noise gives planes that do share a ray a full rank, and the linear solution then puts the camera on the
+    point that all lines have in common, where every residual is small.
+    """
+    first, last = _homogeneous(pairs.image_start), _homogeneous(pairs.image_end)
+    seen = K @ ray
+    # The distance is the triple product (first, last, seen) but for a factor that divides out.
+    distance = np.cross(first, last) @ seen
+    slopes = np.concatenate([np.cross(last, seen)[:, :2], np.cross(seen, first)[:, :2]], axis=1)
+    variance = np.trace(pairs.covariance, axis1=1, axis2=2) / 2 * (slopes**2).sum(axis=1)
+    statistic = float((distance**2 / np.maximum(variance, 1e-300)).sum())
+    return statistic <= float(chdtri(len(pairs) - 2, _BY_CHANCE))
 
 
 def _stage_sigmas(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> tuple[Floats, Floats]:

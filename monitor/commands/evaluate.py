@@ -1,6 +1,7 @@
 """``calibwatch evaluate``: measured on data whose truth is known."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -11,7 +12,9 @@ LONGEST_SIDE = 1280
 """px; the network's input rule (pipeline.segmentation) reduces longer images anyway. Here for --help."""
 
 
-@click.group(epilog="Examples: calibwatch evaluate masks training/; calibwatch evaluate masks my_set/ --json")
+@click.group(
+    epilog="Examples: calibwatch evaluate masks training/; calibwatch evaluate plk-table1 --out out/plk"
+)
 def command() -> None:
     """Measure calibwatch on data whose truth is known."""
 
@@ -75,6 +78,116 @@ def masks_command(
         write(found, folder)
     click.echo(found.model_dump_json(indent=1) if as_json else tables(found))
     return 0
+
+
+def _plk_options(runs: int) -> Callable[[Callable[..., object]], Callable[..., object]]:
+    """``--runs``, ``--seed``, ``--json`` and ``--out`` of the experiments of PLK-Calib."""
+
+    def add(function: Callable[..., object]) -> Callable[..., object]:
+        function = click.option(
+            "--out",
+            type=click.Path(path_type=Path, file_okay=False),
+            help="Folder for the tables (.md), the figures (.json) and the picture (.png).",
+        )(function)
+        function = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")(function)
+        function = click.option(
+            "--seed",
+            type=click.IntRange(0, 2**32 - 1),
+            default=0,
+            show_default=True,
+            help="Seed of the noise.",
+        )(function)
+        return click.option(
+            "--runs",
+            type=click.IntRange(1, 100_000),
+            default=runs,
+            show_default=True,
+            help="Runs of each row, box or point.",
+        )(function)
+
+    return add
+
+
+@command.command(
+    name="plk-table1",
+    epilog="Examples: calibwatch evaluate plk-table1; calibwatch evaluate plk-table1 --runs 1000 --json",
+)
+@_plk_options(200)
+def table_command(*, runs: int, seed: int, as_json: bool, out: Path | None) -> int:
+    """Solve the scenes of PLK-Calib's Table I: methods I, II and ours, 0.3 and 1 px.
+
+    Says for each row whether the bar is held, and exits with 1 if one is missed. The bar was set for 200
+    runs: medians of fewer scatter more.
+    """
+    from monitor.plk_evaluation import table  # noqa: PLC0415 - numpy is not needed for --help
+    from monitor.plk_tables import table_text  # noqa: PLC0415 - likewise
+
+    folder = _made(out)
+    found = table(runs, seed, _progress)
+    _clear()
+    _deliver(folder, "plk-table1", table_text(found), found.model_dump_json(indent=1), None, as_json=as_json)
+    return 0 if found.met else 1
+
+
+@command.command(
+    name="plk-fig5",
+    epilog="Examples: calibwatch evaluate plk-fig5 --out out/plk; calibwatch evaluate plk-fig5 --json",
+)
+@_plk_options(50)
+def boxes_command(*, runs: int, seed: int, as_json: bool, out: Path | None) -> int:
+    """Draw box plots of the errors from 5 deg about and 0.5 m along each axis off (PLK-Calib's Fig. 5).
+
+    Near, middling and far simulated lines stand for the published recordings.
+    """
+    from monitor.plk_evaluation import box_plots  # noqa: PLC0415 - numpy is not needed for --help
+    from monitor.plk_tables import box_picture, box_text  # noqa: PLC0415 - likewise
+
+    folder = _made(out)
+    found = box_plots(runs, seed, _progress)
+    _clear()
+    picture = None if folder is None else box_picture(found)
+    _deliver(folder, "plk-fig5", box_text(found), found.model_dump_json(indent=1), picture, as_json=as_json)
+    return 0
+
+
+@command.command(
+    name="plk-fig6",
+    epilog="Examples: calibwatch evaluate plk-fig6 --out out/plk; calibwatch evaluate plk-fig6 --json",
+)
+@_plk_options(20)
+def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) -> int:
+    """Draw success by the initial error along one axis, the other half of the pose held (PLK-Calib's Fig. 6).
+
+    Up to 5 m along the LiDAR's y axis with only the translation sought, up to 46 deg about its z axis with
+    only the rotation sought.
+    """
+    from monitor.plk_evaluation import offsets  # noqa: PLC0415 - numpy is not needed for --help
+    from monitor.plk_tables import offsets_picture, offsets_text  # noqa: PLC0415 - likewise
+
+    folder = _made(out)
+    found = offsets(runs, seed, _progress)
+    _clear()
+    picture = None if folder is None else offsets_picture(found)
+    _deliver(
+        folder, "plk-fig6", offsets_text(found), found.model_dump_json(indent=1), picture, as_json=as_json
+    )
+    return 0
+
+
+def _made(out: Path | None) -> Path | None:
+    from monitor.mask_tables import made  # noqa: PLC0415 - loaded with the rest
+
+    return None if out is None else made(out)
+
+
+def _deliver(
+    folder: Path | None, name: str, text: str, document: str, picture: bytes | None, *, as_json: bool
+) -> None:
+    from monitor.plk_tables import write  # noqa: PLC0415 - loaded with the rest
+
+    if folder is not None:
+        write(folder, name, text, document, picture)
+    click.echo(document if as_json else text)
 
 
 def _progress(name: str, done: int, of: int) -> None:

@@ -1,21 +1,11 @@
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline import plk, se3
+from pipeline import plk_scenes as scenes
 from pipeline.observability import in_vehicle_axes, observable
-
-_spec = importlib.util.spec_from_file_location(
-    "plk_scenes", Path(__file__).parents[1] / "oracles" / "plk_scenes.py"
-)
-scenes = importlib.util.module_from_spec(_spec)
-sys.modules["plk_scenes"] = scenes
-_spec.loader.exec_module(scenes)
 
 RUNS = 200
 LIMITS = np.array([np.radians(0.25)] * 3 + [0.05] * 3)
@@ -37,7 +27,7 @@ def in_mount_axes(solution):
 def test_jacobian_agrees_with_differences(seed, skew):
     rng = np.random.default_rng(seed)
     K = scenes.K + np.array([[rng.uniform(-90, 90), skew, 0], [0, 0, 0], [0, 0, 0]])
-    pairs = scenes.pairs_of("e", 1.0, rng)
+    pairs = scenes.observed(scenes.scene("e"), 1.0, rng)
     T = se3.retract(scenes.TRUTH, rng.normal(0, [0.02] * 3 + [0.1] * 3))
     J = plk.jacobians(pairs, K, T)
     step = 1e-6
@@ -52,7 +42,7 @@ def test_jacobian_agrees_with_differences(seed, skew):
 
 def test_residual_is_the_distance_from_the_join_of_projected_points():
     rng = np.random.default_rng(0)
-    pairs = scenes.pairs_of("e", 5.0, rng)
+    pairs = scenes.observed(scenes.scene("e"), 5.0, rng)
     foot, top = (se3.apply(scenes.TRUTH, points) @ scenes.K.T for points in (pairs.start, pairs.end))
     foot, top = foot[:, :2] / foot[:, 2:], top[:, :2] / top[:, 2:]
     along = (top - foot) / np.linalg.norm(top - foot, axis=1, keepdims=True)
@@ -64,7 +54,7 @@ def test_residual_is_the_distance_from_the_join_of_projected_points():
 
 
 def test_plane_normals_hold_the_projected_line():
-    pairs = scenes.pairs_of("e", 0.0 + 1e-12, np.random.default_rng(0))
+    pairs = scenes.observed(scenes.scene("e"), 0.0 + 1e-12, np.random.default_rng(0))
     n_cam, _ = plk.plucker(se3.apply(scenes.TRUTH, pairs.start), se3.apply(scenes.TRUTH, pairs.end))
     n_cam /= np.linalg.norm(n_cam, axis=1, keepdims=True)
     normals = plk.plane_normals(pairs, scenes.K)
@@ -74,7 +64,7 @@ def test_plane_normals_hold_the_projected_line():
 def medians(name, sigma_px, method):
     rng = np.random.default_rng(1)
     return np.median(
-        [errors(method(scenes.pairs_of(name, sigma_px, rng))) for _ in range(RUNS)], axis=0
+        [errors(method(scenes.observed(scenes.scene(name), sigma_px, rng))) for _ in range(RUNS)], axis=0
     ).tolist()
 
 
@@ -100,7 +90,7 @@ def test_table_one_medians_of_three_lines(name, sigma_px, rotation, translation)
 def test_methods_agree_on_three_lines(name, sigma_px):
     rng = np.random.default_rng(2)
     for _ in range(RUNS):
-        pairs = scenes.pairs_of(name, sigma_px, rng)
+        pairs = scenes.observed(scenes.scene(name), sigma_px, rng)
         two = plk.method_two(pairs, scenes.K, scenes.START)
         assert np.abs(two - one(pairs)).max() < 1e-9
 
@@ -123,7 +113,7 @@ def test_parallel_lines_leave_only_the_shift_along_them(name, rotation):
     along = np.array([0.2, 1.0, 0.1]) / np.linalg.norm([0.2, 1.0, 0.1])
     angles = []
     for _ in range(RUNS):
-        pairs = scenes.pairs_of(name, 0.3, rng)
+        pairs = scenes.observed(scenes.scene(name), 0.3, rng)
         assert plk.method_two(pairs, scenes.K, scenes.START) is None
         solution = plk.method_one(pairs, scenes.K, scenes.START)
         seen = observable(in_mount_axes(solution), LIMITS)
@@ -152,7 +142,7 @@ def test_stated_sigma_is_honest():
     rng = np.random.default_rng(5)
     inside = []
     for _ in range(RUNS):
-        solution = plk.method_one(scenes.pairs_of("e", 1.0, rng), scenes.K, scenes.TRUTH)
+        solution = plk.method_one(scenes.observed(scenes.scene("e"), 1.0, rng), scenes.K, scenes.TRUTH)
         xi = se3.local(scenes.TRUTH, solution.T_cam_lidar)
         inside.append(np.abs(xi) / np.sqrt(np.diag(np.linalg.inv(solution.information))) < 1)
     assert np.mean(inside) == pytest.approx(0.683, abs=0.05)
@@ -160,7 +150,7 @@ def test_stated_sigma_is_honest():
 
 def test_one_wrong_line_among_ten_is_outvoted():
     rng = np.random.default_rng(6)
-    pairs = scenes.pairs_of("e", 0.3, rng)
+    pairs = scenes.observed(scenes.scene("e"), 0.3, rng)
     moved = pairs.image_start.copy()
     moved[3] += [25.0, 10.0]
     wrong = plk.LinePairs(pairs.start, pairs.end, moved, pairs.image_end, pairs.covariance)
@@ -170,7 +160,7 @@ def test_one_wrong_line_among_ten_is_outvoted():
 
 
 def test_prior_holds_what_the_lines_leave_free_and_stays_out_of_the_information():
-    pairs = scenes.pairs_of("c", 0.3, np.random.default_rng(7))
+    pairs = scenes.observed(scenes.scene("c"), 0.3, np.random.default_rng(7))
     prior = plk.Prior(scenes.TRUTH, np.diag([1 / np.radians(1.0) ** 2] * 3 + [1 / 0.15**2] * 3))
     with_prior = plk.method_one(pairs, scenes.K, scenes.TRUTH, prior=prior)
     assert errors(with_prior.T_cam_lidar)[1] < 0.2
@@ -187,7 +177,7 @@ def test_prior_holds_what_the_lines_leave_free_and_stays_out_of_the_information(
 @given(st.permutations(range(10)), st.lists(st.booleans(), min_size=10, max_size=10))
 @settings(max_examples=10, deadline=None)
 def test_order_of_lines_and_of_ends_does_not_matter(order, flip):
-    pairs = scenes.pairs_of("e", 1.0, np.random.default_rng(8))
+    pairs = scenes.observed(scenes.scene("e"), 1.0, np.random.default_rng(8))
     flip = np.array(flip)[:, None]
     turned = plk.LinePairs(
         np.where(flip, pairs.end, pairs.start)[order],
@@ -200,7 +190,7 @@ def test_order_of_lines_and_of_ends_does_not_matter(order, flip):
 
 
 def test_line_sensitivity_predicts_the_shift_of_a_projected_line():
-    pairs = scenes.pairs_of("e", 1e-12, np.random.default_rng(9))
+    pairs = scenes.observed(scenes.scene("e"), 1e-12, np.random.default_rng(9))
     start, end = (se3.apply(scenes.TRUTH, points) for points in (pairs.start, pairs.end))
     n_cam, _ = plk.plucker(start, end)
     kappa = plk.line_sensitivity(n_cam, scenes.K)

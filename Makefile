@@ -10,7 +10,7 @@ OUT ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: env demo test test-full lint bench train export scenes figures-masks clean
+.PHONY: env demo test test-full lint bench train export scenes figures-masks figures-plk clean
 
 env: $(STAMP)
 
@@ -77,6 +77,11 @@ export-free: $(TRAIN)/.installed
 
 figures-masks: env
 	$(BIN)/calibwatch evaluate masks $(DATA) --out $(OUT)/masks
+
+figures-plk: env
+	$(BIN)/calibwatch evaluate plk-table1 --out $(OUT)/plk
+	$(BIN)/calibwatch evaluate plk-fig5 --out $(OUT)/plk
+	$(BIN)/calibwatch evaluate plk-fig6 --out $(OUT)/plk
 
 clean:
 	rm -rf $(VENV) $(TRAIN) $(OUT) build *.egg-info

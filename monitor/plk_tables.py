@@ -37,8 +37,8 @@ def table_text(found: Table) -> str:
     lines += [
         "",
         "What ours says of itself: the rank of its information; the angle between the direction that it",
-        "holds and the right one (worst run); medians of its error in the directions that it sees; its squared",
-        "normalised error against chi-square: mean over freedom, share below the 95 % point, p.",
+        "holds and the right one (worst run); medians of its error in the directions that it sees; its",
+        "squared normalised error against chi-square: mean over freedom, share below the 95 % point, p.",
         "",
         "| scene | noise, px | rank (runs) | held, deg off | seen, rad / m | mean | below 95 % | p |",
         "|---|---|---|---|---|---|---|---|",

@@ -125,7 +125,7 @@ def test_parallel_lines_leave_only_the_shift_along_them(name, rotation):
     assert np.median(angles) <= rotation
 
 
-@pytest.mark.parametrize("sigma_px", [1e-9, 0.3, 1.0, 3.0])
+@pytest.mark.parametrize("sigma_px", [1e-9, 0.3, 1.0])
 def test_planes_that_share_a_ray_but_for_noise_are_no_start(sigma_px):
     """Else the linear solution puts the camera on the corner, where all residuals are small."""
     rng = np.random.default_rng(4)

@@ -129,6 +129,7 @@ def _draw(canvas: NDArray[np.uint8], panel: Panel, legend: Sequence[str]) -> Non
         x, _ = at(value, panel.y.low)
         _line(canvas, (x, bottom), (x, bottom + 5), _BLACK)
         _text(canvas, name, (x, bottom + 21), anchor=0.5)
+    cv2.rectangle(canvas, (left, top), (right, bottom), _BLACK, 1)
     for mark in panel.marks:
         if isinstance(mark, Curve):
             _curve(
@@ -136,7 +137,6 @@ def _draw(canvas: NDArray[np.uint8], panel: Panel, legend: Sequence[str]) -> Non
             )
         else:
             _box(canvas, mark, at)
-    cv2.rectangle(canvas, (left, top), (right, bottom), _BLACK, 1)
     _text(canvas, panel.title, (left, 20), anchor=0.0)
     _text(canvas, panel.x.label, ((left + right) / 2, bottom + 44), anchor=0.5)
     _upright(canvas, panel.y.label, (14, (top + bottom) // 2))
@@ -149,7 +149,7 @@ def _draw(canvas: NDArray[np.uint8], panel: Panel, legend: Sequence[str]) -> Non
 def _curve(canvas: NDArray[np.uint8], points: Sequence[tuple[float, float] | None], curve: Curve) -> None:
     colour = COLOURS[curve.index]
     # Curves that lie on each other stay visible: the first is the thickest.
-    thickness = 2 * (len(COLOURS) - curve.index) - 1
+    thickness = 3 * (len(COLOURS) - curve.index) - 1
     for one, other in itertools.pairwise(points):
         if one is not None and other is not None:
             _line(canvas, one, other, colour, thickness)

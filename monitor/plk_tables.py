@@ -174,7 +174,8 @@ def offsets_picture(found: Offsets) -> bytes:
     for half, sweep in found.halves.items():
         last = next(iter(sweep.methods.values()))[-1].offset
         x = steps(0.0, last, 1.0 if half == "translation" else 5.0, _AXES[half])
-        shares = steps(0.0, 1.0, 0.2, f"share below {sweep.success_below:g} {sweep.unit}")
+        # Above 1, so that a curve at 1 is not taken for the frame.
+        shares = steps(0.0, 1.05, 0.2, f"share below {sweep.success_below:g} {sweep.unit}")
         above.append(Panel(f"Success, only {half} sought", x, shares, _curves(sweep, median=False)))
         medians = _curves(sweep, median=True)
         values = [y for curve in medians for y in curve.y if y is not None]

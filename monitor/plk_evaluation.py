@@ -103,7 +103,7 @@ def _row(name: str, sigma_px: float, trials: Sequence[Trial]) -> Row:
         scene=name,
         sigma_px=sigma_px,
         methods={method: _median(trials, method) for method in METHODS},
-        gap=finite(max(trial.gap for trial in trials)),
+        gap=max((trial.gap for trial in trials if math.isfinite(trial.gap)), default=None),
         rank_wanted=wanted,
         ranks={rank: ranks.count(rank) for rank in sorted(set(ranks))},
         held_deg=finite(math.degrees(max(trial.held_angle for trial in trials))),

@@ -1,5 +1,6 @@
 """PLK-Calib's experiments as Markdown and pictures, for people, and as files."""
 
+import math
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -54,16 +55,24 @@ def table_text(found: Table) -> str:
 
 
 def _medians(row: Row, runs: int) -> str:
-    cells = " | ".join(_median(row.methods[method], runs) for method in METHODS)
-    return f"| {_SCENES[row.scene]} | {row.sigma_px:g} | {cells} |"
+    one, two, ours = (_median(row.methods[method], runs) for method in METHODS)
+    if max(row.ranks) < 6:
+        # Ours knows that what the start left along the held direction is no answer, and does not tell it.
+        ours = (
+            f"{_rotation(row.seen_rotation_rad)} / {row.seen_translation_m:.3g}, one direction not observed"
+        )
+    return f"| {_SCENES[row.scene]} | {row.sigma_px:g} | {one} | {two} | {ours} |"
 
 
 def _median(found: Median, runs: int) -> str:
     if found.rotation_rad is None or found.translation_m is None:
         return "says: not to be solved"
     few = "" if found.answers == runs else f" ({found.answers} answers)"
-    degrees = np.degrees(found.rotation_rad)
-    return f"{found.rotation_rad:.4g} ({degrees:.2g}) / {found.translation_m:.3g}{few}"
+    return f"{_rotation(found.rotation_rad)} / {found.translation_m:.3g}{few}"
+
+
+def _rotation(value_rad: float) -> str:
+    return f"{value_rad:.4g} ({math.degrees(value_rad):.2g})"
 
 
 def _statement(row: Row) -> str:

@@ -5,12 +5,25 @@ from importlib import resources
 
 import pytest
 
-from monitor.model_file import DEFAULT_NAME, model_bytes
+from monitor.model_file import DEFAULT_NAME, FREE, FREE_NAME, model_bytes, open_segmenter
 from pipeline.errors import ModelError
 
 
 def test_without_a_name_it_is_the_one_that_ships():
     assert model_bytes(None) == (resources.files("models") / DEFAULT_NAME).read_bytes()
+
+
+def test_the_free_one_is_asked_for_by_its_word_unless_a_file_bears_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert model_bytes(FREE) == (resources.files("models") / FREE_NAME).read_bytes()
+    (tmp_path / FREE).write_bytes(b"mine")
+    assert model_bytes(FREE) == b"mine"
+
+
+def test_both_that_ship_keep_the_contract_and_are_small():
+    infos = [open_segmenter(path, threads=1).info for path in (None, FREE)]
+    assert infos[0].training_data != infos[1].training_data
+    assert all(len(model_bytes(path)) < 10_000_000 for path in (None, FREE))
 
 
 def test_a_named_file_is_read_as_it_is(tmp_path):
@@ -32,5 +45,6 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path):
         model_bytes(path)
 
 
-def test_the_network_that_ships_names_no_file_of_the_machine_that_made_it():
-    assert b".py" not in model_bytes(None)
+@pytest.mark.parametrize("path", [None, FREE])
+def test_the_networks_that_ship_name_no_file_of_the_machine_that_made_them(path):
+    assert b".py" not in model_bytes(path)

@@ -1,6 +1,7 @@
 """Where the network comes from."""
 
 import os
+import re
 from importlib import resources
 
 import pytest
@@ -47,4 +48,4 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path):
 
 @pytest.mark.parametrize("path", [None, FREE])
 def test_the_networks_that_ship_name_no_file_of_the_machine_that_made_them(path):
-    assert b".py" not in model_bytes(path)
+    assert not re.search(rb"\w{4}\.py", model_bytes(path))  # fewer letters come about by chance

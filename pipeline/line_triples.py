@@ -19,20 +19,6 @@ from pipeline.records import CameraModel, CloudLine, Floats, ImageLine, LineLabe
 Indices: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 
-Reason: TypeAlias = Literal[
-    "fewer than two lanes in the image",
-    "no pole in the image",
-    "fewer than two lanes in the cloud",
-    "no pole in the cloud",
-    "no two parallel lanes apart from each other in the cloud",
-    "the image's lanes lie in one plane with the camera",
-    "every pole stands dead ahead or in line with the lanes",
-    "no correspondence puts the lines in front of an upright camera above the road",
-    "no candidate meets the masks",
-]
-"""Why a scene gives no coarse extrinsic."""
-
-
 NoTriplesReason: TypeAlias = Literal[
     "fewer than two lanes in the image",
     "no pole in the image",
@@ -44,6 +30,9 @@ NoTriplesReason: TypeAlias = Literal[
     "no correspondence puts the lines in front of an upright camera above the road",
 ]
 """Why no correspondence is left."""
+
+Reason: TypeAlias = NoTriplesReason | Literal["no candidate meets the masks"]
+"""Why a scene gives no coarse extrinsic."""
 
 
 @dataclass(frozen=True, slots=True)

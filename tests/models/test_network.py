@@ -116,7 +116,7 @@ def _folder(tmp_path):
 
 
 def test_training_learns_resumes_and_keeps_to_its_time(tmp_path):
-    """A clock that ticks one second a look: 30 s are 30 steps, and a second call goes on from there."""
+    """A clock that ticks one second a look: 15 s are 15 steps, and a second call goes on from there."""
     torch.manual_seed(0)
     recipe = train.Recipe(crop=(64, 64), batch=2, warm_up=5, save_s=7.0, rate=5e-3, fall=0.9)
     sets = read_sets([_folder(tmp_path)])
@@ -145,10 +145,10 @@ def test_training_learns_resumes_and_keeps_to_its_time(tmp_path):
     before_fall = train.start(recipe, device)
     before_fall.load(tmp_path / train.BEFORE_FALL)
     assert before_fall.step == 2
-    second = go_on(0.75)
-    assert (second.step, second.spent_s) == (45, 45.0)
+    second = go_on(1.5)
+    assert (second.step, second.spent_s) == (90, 90.0)
     before_fall.load(tmp_path / train.BEFORE_FALL)
-    assert before_fall.step == 2  # 15 of 45 s: the rate was falling already
+    assert before_fall.step == 2  # 15 of 90 s: the rate was falling already
     assert not list(tmp_path.glob("*.tmp"))
     rgb, label, _ = sampler.batch(4, np.random.default_rng(3))
     with torch.no_grad():

@@ -28,8 +28,9 @@ lint: env
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 
+# SEED fixes the order and the random examples, where a verdict must not depend on chance.
 test: lint
-	$(BIN)/pytest -m 'not slow'
+	$(BIN)/pytest -m 'not slow' $(if $(SEED),--randomly-seed=$(SEED))
 
 test-full: lint
 	$(BIN)/pytest

@@ -116,7 +116,7 @@ def _classes(given: object, key: str) -> list[int]:
     if not isinstance(given, list) or not all(
         isinstance(c, int) and not isinstance(c, bool) and 0 <= c < len(NAMES) for c in given
     ):
-        raise ValueError(f"{key} {str(given)[:80]} is no list of classes 0 to {len(NAMES) - 1}")
+        raise ValueError(f"{key} {repr(given)[:80]} is no list of classes 0 to {len(NAMES) - 1}")
     return given
 
 

@@ -241,7 +241,7 @@ def _stamp_ns(line: str, path: Path, number: int) -> int | None:
         second = None
     if match is None or second is None:
         raise InputError(
-            f"{path}:{number}: '{line[:40]}' is no time stamp", hint="as in 2011-09-26 13:08:27.657852672"
+            f"{path}:{number}: {line[:40]!r} is no time stamp", hint="as in 2011-09-26 13:08:27.657852672"
         )
     return int(second.timestamp()) * 1_000_000_000 + int((match[2] or "").ljust(9, "0"))
 

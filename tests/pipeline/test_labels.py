@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pipeline import labels
@@ -85,6 +85,7 @@ def test_what_is_no_description_is_refused(said):
 
 
 @given(said=st.fixed_dictionaries({}, optional=dict.fromkeys(GOOD, JSON)) | JSON)
+@example(said=GOOD | {"labelled_classes": "\r"})
 def test_any_json_ends_in_a_description_or_in_one_line(said):
     told = ""
     try:

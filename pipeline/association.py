@@ -34,6 +34,11 @@ MODEL_M = 0.015
 """m; paint's bright middle and its painted middle differ, poles taper: common to all points of a line."""
 
 
+_NODES = 0.5 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * 0.5 / np.sqrt(3.0)
+"""Weights of the ends of the part in common at the two places where lines are compared. There a line of least
+squares through an evenly covered stretch of a bend lies on the bend, and straight lines lose nothing."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Association:
     """Accepted pairs of one frame.
@@ -134,8 +139,9 @@ def pairs_on_overlap(
 ) -> tuple[NDArray[np.int64], plk.LinePairs]:
     """Every pair of one class that has enough in common, cut to it, with its covariance (FORMULAS D1).
 
-    Positions of the image ends on the cloud line follow from the projection: 1/depth is linear along the
-    image line. They need no more than the gate's accuracy.
+    The pairs hold the two Gauss nodes of the part in common, on the image line and on the course of the cloud
+    line. Positions on the cloud line follow from the projection: 1/depth is linear along the image line. They
+    need no more than the gate's accuracy.
 
     Returns:
         Indices (M,2) of cloud and image line, and the M pairs.
@@ -158,22 +164,25 @@ def pairs_on_overlap(
     shorter = np.minimum(length[:, 0], np.ptp(tau, axis=1))
     common = covered[:, 1] - covered[:, 0]
     enough = cloud.visible & (common >= np.maximum(MIN_OVERLAP_PX * unit, MIN_OVERLAP_SHARE * shorter))
-    share = (covered - tau[:, :1]) / np.where(enough, tau[:, 1] - tau[:, 0], 1.0)[:, None]
+    place = covered @ _NODES.T
+    share = (place - tau[:, :1]) / np.where(enough, tau[:, 1] - tau[:, 0], 1.0)[:, None]
     z = 1.0 / ((1 - share) / cloud.depth[:, :1] + share / cloud.depth[:, 1:])
     arm = cloud.first[:, None] + cloud.length[:, None] * share * z / cloud.depth[:, 1:]
-    fit = cloud.noise[:, None, None] * (
-        cloud.per_point[:, None, None] + arm[:, :, None] * arm[:, None, :] / cloud.spread[:, None, None]
-    )
+    powers = np.stack([np.ones_like(arm), arm, arm**2], axis=2)
+    fit = powers @ cloud.course @ powers.transpose(0, 2, 1)
     sigma_px = np.array([line.sigma_px for line in image])
-    noise = sigma_px[:, None, None] ** 2 * np.eye(2) + (cloud.kappa**2)[:, None, None] * (
-        fit + MODEL_M**2
-    ) / (z[:, :, None] * z[:, None, :])
+    own = place / length
+    weight = np.stack([1.0 - own, own], axis=2)
+    noise = sigma_px[:, None, None] ** 2 * (weight @ weight.transpose(0, 2, 1)) + (cloud.kappa**2)[
+        :, None, None
+    ] * (fit + MODEL_M**2) / (z[:, :, None] * z[:, None, :])
     enough &= np.isfinite(noise).all(axis=(1, 2))
+    nodes = cloud.mean[:, None] + arm[:, :, None] * cloud.direction[:, None] + powers @ cloud.offset
     pairs = plk.LinePairs(
-        np.stack([cloud_lines[i].start for i in rows[:, 0]]),
-        np.stack([cloud_lines[i].end for i in rows[:, 0]]),
-        start + covered[:, :1] * along,
-        start + covered[:, 1:] * along,
+        nodes[:, 0],
+        nodes[:, 1],
+        start + place[:, :1] * along,
+        start + place[:, 1:] * along,
         noise,
     )
     return rows[enough], plk.select(pairs, enough)
@@ -190,9 +199,10 @@ class _SeenParts:
         first: (N,), m, its first end along the line, from the mean of the line's points.
         length: (N,), m.
         kappa: (N,), px, sensitivity of FORMULAS D1.
-        noise: (N,), m^2, sigma_m squared.
-        per_point: (N,), 1/m of D1.
-        spread: (N,), m^2.
+        mean: (N,3), m, LiDAR frame, mean of each line's points.
+        direction: (N,3), unit.
+        offset: (N,3,3), course against the straight line (LineArc).
+        course: (N,3,3), its covariance; a straight line has none in the third place.
     """
 
     visible: NDArray[np.bool_]
@@ -201,14 +211,16 @@ class _SeenParts:
     first: Floats
     length: Floats
     kappa: Floats
-    noise: Floats
-    per_point: Floats
-    spread: Floats
+    mean: Floats
+    direction: Floats
+    offset: Floats
+    course: Floats
 
 
 def _seen_parts(lines: Sequence[CloudLine], camera: CameraModel, T_cam_lidar: Floats) -> _SeenParts:
-    ends = np.stack([np.stack([line.start, line.end]) for line in lines]) @ T_cam_lidar[:3, :3].T
-    ends = ends + T_cam_lidar[:3, 3]
+    start, end = np.stack([line.start for line in lines]), np.stack([line.end for line in lines])
+    direction = (end - start) / np.maximum(np.linalg.norm(end - start, axis=1), 1e-9)[:, None]
+    ends = np.stack([start, end], axis=1) @ T_cam_lidar[:3, :3].T + T_cam_lidar[:3, 3]
     span = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(span, axis=1)
     near = ends[:, :, 2] < MIN_DEPTH_M
@@ -234,7 +246,13 @@ def _seen_parts(lines: Sequence[CloudLine], camera: CameraModel, T_cam_lidar: Fl
         cut[:, 0] * length - mean,
         (cut[:, 1] - cut[:, 0]) * length,
         plk.line_sensitivity(n_cam, camera.K),
-        np.array([line.sigma_m**2 for line in lines]),
-        np.array([1.0 / max(len(line.points), 1) for line in lines]),
-        np.array([max(line.spread, 1e-9) for line in lines]),
+        start + mean[:, None] * direction,
+        direction,
+        np.stack([np.zeros((3, 3)) if line.arc is None else line.arc.offset for line in lines]),
+        np.stack([_straight(line) if line.arc is None else line.arc.covariance for line in lines]),
     )
+
+
+def _straight(line: CloudLine) -> Floats:
+    """Covariance (3,3) of a straight line's course: 1/m and 1/S of FORMULAS D1."""
+    return np.diag([1.0 / max(len(line.points), 1), 1.0 / max(line.spread, 1e-9), 0.0]) * line.sigma_m**2

@@ -13,6 +13,7 @@ from pipeline.cloud_lanes import find_lanes
 from pipeline.cloud_poles import find_poles
 from pipeline.ground import Ground, fit_ground
 from pipeline.image_lines import find_image_lines
+from pipeline.line_arcs import with_arc
 from pipeline.records import (
     CameraImage,
     CameraModel,
@@ -109,7 +110,8 @@ def find_lines(
         seen = in_view(cloud, camera, T_cam_lidar)
         if cloud.intensity is None:
             reasons.append("no lane lines in a cloud without intensity")
-        lines += [_along(line, forward) for line in find_lanes(cloud, ground, seen, rng)]
+        lanes = find_lanes(cloud, ground, seen, rng)
+        lines += [with_arc(_along(line, forward), cloud) for line in lanes]
         lines += find_poles(cloud, ground, seen)
     return LineFrame(tuple(lines), tuple(find_image_lines(image, masks, camera)), tuple(reasons))
 

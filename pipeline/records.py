@@ -203,6 +203,24 @@ class ImageLine:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LineArc:
+    """How a line bends: its course against the straight one, at distance s from the points' mean.
+
+    Attributes:
+        offset: float64 (3,3), rows c0 (m), c1, c2 (1/m): the course lies ``c0 + c1 s + c2 s^2`` off the
+            straight line.
+        covariance: float64 (3,3), of (c0, c1, c2), the same for each axis across the line.
+    """
+
+    offset: Floats
+    covariance: Floats
+
+    def __post_init__(self) -> None:
+        _hold(self, "offset", np.float64, (3, 3))
+        _hold(self, "covariance", np.float64, (3, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CloudLine:
     """A straight line fitted to points of the cloud.
 
@@ -214,6 +232,7 @@ class CloudLine:
         sigma_m: Noise of one point across the line, metres per axis (sigma_p of FORMULAS D1).
         spread: Sum of squared distances of the points along the line from their mean, m^2 (S of FORMULAS D1).
         mean_m: Distance of the points' mean from ``start`` along the line, metres; None for the middle.
+        arc: How the line bends, s counted from the points' mean towards ``end``; None: it is straight.
     """
 
     label: LineLabel
@@ -223,6 +242,7 @@ class CloudLine:
     sigma_m: float
     spread: float
     mean_m: float | None = None
+    arc: LineArc | None = None
 
     def __post_init__(self) -> None:
         _hold(self, "start", np.float64, (3,))

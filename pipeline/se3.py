@@ -49,6 +49,17 @@ def rotation_angle(R1: Floats, R2: Floats) -> float:
     return 2.0 * math.asin(min(1.0, chord))
 
 
+def pose_error(T_a: Floats, T_b: Floats) -> tuple[float, float]:
+    """How far two extrinsics (4,4) lie apart, m and rad: CRLF (15) and (16).
+
+    (15) is the distance of the translations, (16) the angle between the rotations, 0..pi.
+
+    The translation is that of ``T_cam_lidar``, so that a turn of the camera in place moves it too;
+    :func:`mount_drift` tells the two apart.
+    """
+    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])), rotation_angle(T_a[:3, :3], T_b[:3, :3])
+
+
 def transform(R: Floats, t: Floats) -> Floats:
     """4x4 matrix of rotation (3,3) and translation (3,)."""
     T = np.eye(4)

@@ -1,0 +1,109 @@
+"""How right a set of answers is, and how honest their covariances are, where the truth is known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pipeline.records import Floats
+
+CONFIDENT_SIGMAS = 4.0
+"""An error beyond so many sigmas is a wrong answer given with confidence: 6e-5 of honest ones go there."""
+
+_LEVEL = 0.95
+"""Quantile of chi-square at which answers are counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Honesty:
+    """Stated covariances against errors.
+
+    Attributes:
+        axes: Errors that were compared, those of observable axes.
+        within_one: Share of them within one sigma; 0.683 where the covariance is right.
+        within_two: Within two; 0.954.
+        confident_wrong: How many lie beyond ``CONFIDENT_SIGMAS``.
+        mean_square: Sum of the normalised squared errors over the sum of their degrees of freedom; 1.
+        below_95: Share of answers below the 95 % point of chi-square; 0.95.
+        p: Kolmogorov-Smirnov probability of so large a difference from chi-square by chance.
+    """
+
+    axes: int
+    within_one: float
+    within_two: float
+    confident_wrong: int
+    mean_square: float
+    below_95: float
+    p: float
+
+
+def normalised_square(error: Floats, covariance: Floats, seen: NDArray[np.bool_]) -> float:
+    """``e^T C^-1 e`` over the seen axes of an error (n,) with covariance (n,n): chi-square, their number."""
+    e = error[seen]
+    return float(e @ np.linalg.solve(covariance[np.ix_(seen, seen)], e))
+
+
+def beyond(error: Floats, sigma: Floats, reference_sigma: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """Errors over the sigmas of answer and reference together, float64 (n,); NaN on axes not seen."""
+    ratio = np.abs(error) / np.hypot(sigma, reference_sigma)
+    return np.asarray(np.where(seen, ratio, np.nan), dtype=np.float64)
+
+
+def honesty(
+    errors: Sequence[Floats],
+    covariances: Sequence[Floats],
+    seen: Sequence[NDArray[np.bool_]],
+    reference_sigma: Floats,
+) -> Honesty | None:
+    """Compares answers with what they say of themselves.
+
+    Args:
+        errors: float64 (6,) of each answer, rad and m.
+        covariances: float64 (6,6) of each.
+        seen: bool (6,) of each: axes that it calls observable.
+        reference_sigma: float64 (6,), how well the truth itself is known; 0 in simulation.
+
+    Returns:
+        The comparison, or None where no axis of any answer is observable.
+    """
+    ratios = np.concatenate(
+        [
+            beyond(error, np.sqrt(np.diag(covariance)), reference_sigma, mask)
+            for error, covariance, mask in zip(errors, covariances, seen, strict=True)
+        ]
+        or [np.zeros(0)]
+    )
+    ratios = ratios[np.isfinite(ratios)]
+    if len(ratios) == 0:
+        return None
+    squares, freedom = [], []
+    for error, covariance, mask in zip(errors, covariances, seen, strict=True):
+        if mask.any():
+            squares.append(normalised_square(error, covariance + np.diag(reference_sigma**2), mask))
+            freedom.append(int(mask.sum()))
+    # Answers see different numbers of axes: through their own distribution all of them become uniform.
+    levels = stats.chi2.cdf(squares, freedom)
+    return Honesty(
+        axes=len(ratios),
+        within_one=float((ratios <= 1).mean()),
+        within_two=float((ratios <= 2).mean()),
+        confident_wrong=int((ratios > CONFIDENT_SIGMAS).sum()),
+        mean_square=float(np.sum(squares) / np.sum(freedom)),
+        below_95=float((levels <= _LEVEL).mean()),
+        p=float(stats.kstest(levels, "uniform").pvalue),
+    )
+
+
+def mean_absolute(
+    errors: Sequence[Floats], seen: Sequence[NDArray[np.bool_]] | None = None
+) -> list[float | None]:
+    """Mean absolute error of each axis over answers (6,), or over those that see it; None without any."""
+    found: list[float | None] = []
+    for axis in range(6):
+        values = [
+            abs(float(error[axis])) for i, error in enumerate(errors) if seen is None or bool(seen[i][axis])
+        ]
+        found.append(float(np.mean(values)) if values else None)
+    return found

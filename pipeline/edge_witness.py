@@ -260,7 +260,7 @@ def solve(
     stored = score(batch, T_stored, 0)
     xi, best = _best_maximum(batch, T_stored, stored, parameters)
     T_best = se3.retract(T_stored, xi)
-    chance, spread = _chance(batch, T_stored, parameters, rng)
+    background, spread = chance(batch, T_stored, parameters, rng)
     inside = _best_inside(batch, T_stored, (stored, best), floor, parameters)
     at_best = score_only(batch, T_best, 0)
     at_inside = score_only(batch, se3.retract(T_stored, inside), 0)
@@ -270,8 +270,8 @@ def solve(
         covariance=_covariance(batch, T_best, parameters),
         score=best,
         score_stored=stored[0],
-        contrast=best / chance - 1.0 if chance > 0 else 0.0,
-        peak=(best - chance) / spread if spread > 0 else 0.0,
+        contrast=best / background - 1.0 if background > 0 else 0.0,
+        peak=(best - background) / spread if spread > 0 else 0.0,
         loss=max(0.0, 1.0 - float(at_inside.sum() / at_best.sum()) + penalty) if best > 0 else 0.0,
         block_gains=_block_gains(batch.slot, at_best, at_inside),
         edges=len(batch),
@@ -301,17 +301,17 @@ def _best_maximum(
     batch: EdgeBatch, T_stored: Floats, stored: _Scored, parameters: EdgeWitnessParameters
 ) -> tuple[Floats, float]:
     """The nearest maximum, unless one that a coarser level leads to scores clearly more."""
-    nearest, value = _ascend(batch, T_stored, np.zeros(6), 0, parameters, stored)
+    nearest, value = ascend(batch, T_stored, np.zeros(6), 0, parameters, stored)
     xi, best = np.zeros(6), stored[0]
     thin = batch.thinned(_COARSE_STRIDE)
     for schedule in ((), (1, 0), (2, 1, 0)):
         candidate = nearest if not schedule else np.zeros(6)
         for level in schedule:
-            candidate, _ = _ascend(thin, T_stored, candidate, level, parameters)
+            candidate, _ = ascend(thin, T_stored, candidate, level, parameters)
         if schedule and np.linalg.norm((candidate - nearest) / UNITS) < _SAME_MODE:
             continue
         if schedule:
-            candidate, value = _ascend(batch, T_stored, candidate, 0, parameters)
+            candidate, value = ascend(batch, T_stored, candidate, 0, parameters)
         wanted = best * (1.0 + parameters.least_gain) if schedule else best
         if value > wanted and _near(candidate, parameters):
             xi, best = candidate, value
@@ -335,11 +335,11 @@ def _from_further_away(
     steps = np.diag([parameters.wide_rad] * 3 + [parameters.wide_m] * 3)
     top, height = xi, score(thin, se3.retract(T_stored, xi), 0)[0]
     for start in np.concatenate([steps, -steps]):
-        reached, _ = _ascend(thin, T_stored, start, 1, parameters)
-        reached, value = _ascend(thin, T_stored, reached, 0, parameters)
+        reached, _ = ascend(thin, T_stored, start, 1, parameters)
+        reached, value = ascend(thin, T_stored, reached, 0, parameters)
         if value > height and _near(reached, parameters):
             top, height = reached, value
-    return _ascend(batch, T_stored, top, 0, parameters)
+    return ascend(batch, T_stored, top, 0, parameters)
 
 
 _COARSE_STRIDE = 3
@@ -349,7 +349,7 @@ _SAME_MODE = 1.0
 """Alert units; maxima nearer to each other are one, found twice."""
 
 
-def _ascend(
+def ascend(
     batch: EdgeBatch,
     T_stored: Floats,
     xi: Floats,
@@ -357,7 +357,16 @@ def _ascend(
     parameters: EdgeWitnessParameters,
     scored: _Scored | None = None,
 ) -> tuple[Floats, float]:
-    """The top reached from ``xi``, whose score may be known, at one level of the pyramid; its score."""
+    """The top reached from ``xi``, whose score may be known, at one level of the pyramid; its score.
+
+    Args:
+        batch: Edges and gradients.
+        T_stored: float64 (4,4), the extrinsic that ``xi`` perturbs.
+        xi: float64 (6,), where the climb begins, camera axes.
+        level: Of the pyramid.
+        parameters: See there.
+        scored: What :func:`score` gives at ``xi``, where it is known.
+    """
 
     def negative(x: Floats) -> tuple[float, Floats]:
         s, gradient = _score_and_gradient(batch, se3.retract(T_stored, x * UNITS), level)
@@ -437,7 +446,7 @@ def _covariance(batch: EdgeBatch, T: Floats, parameters: EdgeWitnessParameters) 
     return np.asarray(UNITS[:, None] * C * UNITS[None, :], dtype=np.float64)
 
 
-def _chance(
+def chance(
     batch: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParameters, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Mean and standard deviation of the score at far random extrinsics."""

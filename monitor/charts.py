@@ -12,8 +12,19 @@ from numpy.typing import NDArray
 from pipeline.plk_starts import Box
 
 Colour = tuple[int, int, int]
-COLOURS: tuple[Colour, ...] = ((178, 114, 0), (0, 94, 213), (115, 158, 0))
-"""BGR of Okabe and Ito's blue, vermilion and green: told apart by colour-blind readers."""
+COLOURS: tuple[Colour, ...] = (
+    (178, 114, 0),
+    (0, 94, 213),
+    (115, 158, 0),
+    (167, 121, 204),
+    (0, 159, 230),
+    (60, 60, 60),
+)
+"""BGR of Okabe and Ito's blue, vermilion, green, purple and orange, and a dark grey, which colour-blind
+readers tell apart."""
+
+_THICKNESSES = (8, 5, 2)
+"""px; of the first curves: those that lie on each other stay visible. All further ones are as the last."""
 
 _BLACK: Colour = (30, 30, 30)
 _GREY: Colour = (215, 215, 215)
@@ -140,7 +151,8 @@ def _draw(canvas: NDArray[np.uint8], panel: Panel, legend: Sequence[str]) -> Non
     _text(canvas, panel.title, (left, 20), anchor=0.0)
     _text(canvas, panel.x.label, ((left + right) / 2, bottom + 44), anchor=0.5)
     _upright(canvas, panel.y.label, (14, (top + bottom) // 2))
-    x = float(left)
+    # A long legend begins farther left.
+    x = float(max(4, min(left, right - sum(28 + _width(name) + 20 for name in legend))))
     for name, colour in zip(legend, COLOURS, strict=False):
         _line(canvas, (x, 45), (x + 22, 45), colour, 3)
         x = _text(canvas, name, (x + 28, 50), anchor=0.0) + 20
@@ -148,8 +160,7 @@ def _draw(canvas: NDArray[np.uint8], panel: Panel, legend: Sequence[str]) -> Non
 
 def _curve(canvas: NDArray[np.uint8], points: Sequence[tuple[float, float] | None], curve: Curve) -> None:
     colour = COLOURS[curve.index]
-    # Curves that lie on each other stay visible: the first is the thickest.
-    thickness = 3 * (len(COLOURS) - curve.index) - 1
+    thickness = _THICKNESSES[min(curve.index, len(_THICKNESSES) - 1)]
     for one, other in itertools.pairwise(points):
         if one is not None and other is not None:
             _line(canvas, one, other, colour, thickness)
@@ -190,10 +201,15 @@ def _line(
 
 def _text(canvas: NDArray[np.uint8], text: str, point: tuple[float, float], *, anchor: float) -> float:
     """Writes on a base line; ``anchor`` 0 begins at the point, 1 ends there. Returns the x of the end."""
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _TEXT, 1)
+    width = _width(text)
     x = round(point[0] - anchor * width)
     cv2.putText(canvas, text, (x, round(point[1])), cv2.FONT_HERSHEY_SIMPLEX, _TEXT, _BLACK, 1, cv2.LINE_AA)
     return float(x + width)
+
+
+def _width(text: str) -> int:
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _TEXT, 1)
+    return int(width)
 
 
 def _upright(canvas: NDArray[np.uint8], text: str, point: tuple[int, int]) -> None:

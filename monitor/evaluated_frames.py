@@ -38,12 +38,14 @@ class EvaluatedFrame:
         group: Of the set that it belongs to.
         pair: Sweep and image.
         mount: Its extrinsic is the true one.
+        reference_sigma: float64 (6,), how well that is known on each axis, rad and m; 0 in simulation.
     """
 
     name: str
     group: str
     pair: FramePair
     mount: Mount
+    reference_sigma: Floats
 
     def off_by(self, drift: Floats) -> Mount:
         """The mount as it was stored before it moved by ``drift`` (6,), rad, m, to where it is."""
@@ -77,6 +79,13 @@ class EvaluatedFrames:
         return self.count
 
 
+def chained(parts: Sequence[EvaluatedFrames]) -> EvaluatedFrames:
+    """The frames of all parts, one part after the other."""
+    return EvaluatedFrames(
+        sum(part.count for part in parts), lambda: (frame for part in parts for frame in part)
+    )
+
+
 def simulated_frames(count: int, seed: int) -> EvaluatedFrames:
     """Frames of drawn rigs on drawn streets; frame k of a seed is always the same."""
     return EvaluatedFrames(count, lambda: (_simulated(seed, k) for k in range(count)))
@@ -101,17 +110,22 @@ def _simulated(seed: int, index: int) -> EvaluatedFrame:
         "T_vehicle_lidar": parameters.T_vehicle_lidar.tolist(),
     }
     mount = mount_of(parse_rig({"pairs": [document]}, where=SIMULATED).pairs[0])
-    return EvaluatedFrame(f"{len(parameters.lidar.elevations)} rings {seed}/{index}", SIMULATED, pair, mount)
+    name = f"{len(parameters.lidar.elevations)} rings {seed}/{index}"
+    return EvaluatedFrame(name, SIMULATED, pair, mount, np.zeros(6))
 
 
 def recorded_frames(
-    places: Sequence[Path], most: int, tell: Callable[[str], None] = lambda _: None
+    places: Sequence[Path],
+    most: int,
+    reference_sigma: Floats,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> EvaluatedFrames:
     """Frames of every recording in some folders, each with the extrinsic that the recording states.
 
     Args:
         places: Recordings, or folders that contain recordings.
         most: Frames of each pair of each recording; those of a longer one are spread evenly over it.
+        reference_sigma: float64 (6,), how well the recordings know their extrinsic, rad and m.
         tell: Told what of the recordings could not be used, one sentence each.
 
     Raises:
@@ -121,7 +135,7 @@ def recorded_frames(
     recordings = [found for place in places for found in _recordings(place)]
     listed = [_listed(location, group, most, tell) for location, group in recordings]
     count = sum(len(one.chosen) for one in listed)
-    return EvaluatedFrames(count, lambda: (frame for one in listed for frame in _read(one)))
+    return EvaluatedFrames(count, lambda: (frame for one in listed for frame in _read(one, reference_sigma)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,20 +158,25 @@ class _Recording:
 
 
 def _recordings(place: Path) -> list[tuple[Path, str]]:
-    """Recordings at or below a place, each with the name of its set."""
+    """Recordings at or below a place, each with the name of its set.
+
+    A place of which recordings lie deeper than in its own folders is a folder of sets, else it is one set.
+    """
     if not place.exists():
         raise InputError(f"{place} does not exist")
     if _is_recording(place):
         return [(place, place.resolve().name)]
-    found = [
-        (path, path.relative_to(place).parts[0]) for path in _below(place, _DEEPEST) if _is_recording(path)
-    ]
+    found = [path for path in _below(place, _DEEPEST) if _is_recording(path)]
     if not found:
         raise InputError(
             f"{place} holds no frames",
             hint="wanted are folders with calib.json, KITTI raw drives, .mcap, .bag or rosbag2 recordings",
         )
-    return found
+    parts = [path.relative_to(place).parts for path in found]
+    sets = max(map(len, parts)) > 1
+    return [
+        (path, part[0] if sets else place.resolve().name) for path, part in zip(found, parts, strict=True)
+    ]
 
 
 def _below(folder: Path, depth: int) -> Iterator[Path]:
@@ -217,7 +236,7 @@ def _pairs(source: Iterable[object], intake: Intake) -> Iterator[FramePair]:
     yield from intake.flush()
 
 
-def _read(recording: _Recording) -> Iterator[EvaluatedFrame]:
+def _read(recording: _Recording, reference_sigma: Floats) -> Iterator[EvaluatedFrame]:
     mounts = {pair.name: mount_of(pair) for pair in recording.rig.pairs}
     counts = dict.fromkeys(mounts, 0)
     with open_source(str(recording.location)) as source:
@@ -225,9 +244,8 @@ def _read(recording: _Recording) -> Iterator[EvaluatedFrame]:
             number = counts[pair.pair]
             counts[pair.pair] += 1
             if (pair.pair, number) in recording.chosen:
-                yield EvaluatedFrame(
-                    _name(recording, pair.pair, number), recording.group, pair, mounts[pair.pair]
-                )
+                name = _name(recording, pair.pair, number)
+                yield EvaluatedFrame(name, recording.group, pair, mounts[pair.pair], reference_sigma)
 
 
 def _name(recording: _Recording, pair: str, number: int) -> str:

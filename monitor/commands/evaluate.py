@@ -3,10 +3,14 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from monitor import commands
+
+if TYPE_CHECKING:
+    from monitor.evaluated_frames import EvaluatedFrames
 
 LONGEST_SIDE = 1280
 """px; the network's input rule (pipeline.segmentation) reduces longer images anyway. Here for --help."""
@@ -80,29 +84,65 @@ def masks_command(
     return 0
 
 
+def _output_options(function: Callable[..., object]) -> Callable[..., object]:
+    """``--seed``, ``--json`` and ``--out`` of experiments."""
+    function = click.option(
+        "--out",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="Folder for the tables (.md), the figures (.json) and the picture (.png).",
+    )(function)
+    function = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")(function)
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**32 - 1),
+        default=0,
+        show_default=True,
+        help="Seed of whatever is drawn.",
+    )(function)
+
+
 def _plk_options(runs: int) -> Callable[[Callable[..., object]], Callable[..., object]]:
     """``--runs``, ``--seed``, ``--json`` and ``--out`` of the experiments of PLK-Calib."""
 
     def add(function: Callable[..., object]) -> Callable[..., object]:
-        function = click.option(
-            "--out",
-            type=click.Path(path_type=Path, file_okay=False),
-            help="Folder for the tables (.md), the figures (.json) and the picture (.png).",
-        )(function)
-        function = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")(function)
-        function = click.option(
-            "--seed",
-            type=click.IntRange(0, 2**32 - 1),
-            default=0,
-            show_default=True,
-            help="Seed of the noise.",
-        )(function)
+        function = _output_options(function)
         return click.option(
             "--runs",
             type=click.IntRange(1, 100_000),
             default=runs,
             show_default=True,
             help="Runs of each row, box or point.",
+        )(function)
+
+    return add
+
+
+def _frame_options(starts: int) -> Callable[[Callable[..., object]], Callable[..., object]]:
+    """What chooses frames and starts: ``--simulated``, ``--frames``, ``--starts``, ``--seed`` and outputs."""
+
+    def add(function: Callable[..., object]) -> Callable[..., object]:
+        function = _output_options(function)
+        function = commands.model_option(function)
+        function = click.option(
+            "--starts",
+            type=click.IntRange(1, 1000),
+            default=starts,
+            show_default=True,
+            help="Starts of each frame.",
+        )(function)
+        function = click.option(
+            "--frames",
+            type=click.IntRange(1, 100_000),
+            default=3,
+            show_default=True,
+            help="Frames of each camera of a recording, spread evenly: first, middle, last.",
+        )(function)
+        return click.option(
+            "--simulated",
+            metavar="N",
+            type=click.IntRange(0, 100_000),
+            default=0,
+            help="Frames of simulated streets and rigs, whose extrinsic is exactly known.",
         )(function)
 
     return add
@@ -172,6 +212,131 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
         folder, "plk-fig6", offsets_text(found), found.model_dump_json(indent=1), picture, as_json=as_json
     )
     return 0
+
+
+@command.command(
+    name="dataset",
+    epilog="Examples: calibwatch evaluate dataset kitti/ rig_b/ --out out/crlf; "
+    "calibwatch evaluate dataset --simulated 30 --rotation 6 --translation 1",
+)
+@click.argument("places", metavar="[DIR]...", nargs=-1, type=click.Path(path_type=Path))
+@_frame_options(starts=3)
+@click.option(
+    "--rotation",
+    type=click.FloatRange(0.0, 45.0),
+    default=2.0,
+    show_default=True,
+    help="Starts are off by up to so many degrees about each axis.",
+)
+@click.option(
+    "--translation",
+    type=click.FloatRange(0.0, 5.0),
+    default=0.3,
+    show_default=True,
+    help="Starts are off by up to so many metres along each axis.",
+)
+@click.option(
+    "--reference-sigma",
+    type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.0, 1.0)),
+    metavar="DEG M",
+    default=(0.2, 0.05),
+    show_default=True,
+    help="How well the recordings know their own extrinsic, per axis.",
+)
+def dataset_command(
+    *,
+    places: tuple[Path, ...],
+    simulated: int,
+    frames: int,
+    starts: int,
+    rotation: float,
+    translation: float,
+    reference_sigma: tuple[float, float],
+    seed: int,
+    model: Path | None,
+    as_json: bool,
+    out: Path | None,
+) -> int:
+    """Calibrate frames one by one from starts that are off, against the extrinsic that DIR states.
+
+    DIR is a recording or holds some: folders with calib.json, KITTI drives, .mcap, .bag. Mean absolute errors
+    as in CRLF's Table II, what is called observable, whether the stated sigmas are honest, times; with --out
+    cumulative curves too.
+    """
+    from monitor.clock import SystemClock  # noqa: PLC0415 - loaded with the rest
+    from monitor.dataset_evaluation import Options, evaluate  # noqa: PLC0415 - numpy is not needed for --help
+    from monitor.dataset_tables import dataset_picture, dataset_text  # noqa: PLC0415 - likewise
+    from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
+
+    chosen = _frames_of(places, simulated, frames, reference_sigma, seed)
+    folder = _made(out)
+    segmenter = open_segmenter(model, 1)
+    options = Options(starts, rotation, translation, seed)
+    found = evaluate(chosen, segmenter, options, SystemClock(), _progress)
+    _clear()
+    picture = None if folder is None else dataset_picture(found)
+    text, document = dataset_text(found), found.model_dump_json(indent=1)
+    _deliver(folder, "dataset", text, document, picture, as_json=as_json)
+    return 0
+
+
+@command.command(
+    name="basin",
+    epilog="Examples: calibwatch evaluate basin --simulated 6 --out out/crlf; "
+    "calibwatch evaluate basin opencalib/ --json",
+)
+@click.argument("places", metavar="[DIR]...", nargs=-1, type=click.Path(path_type=Path))
+@_frame_options(starts=1)
+def basin_command(
+    *,
+    places: tuple[Path, ...],
+    simulated: int,
+    frames: int,
+    starts: int,
+    seed: int,
+    model: Path | None,
+    as_json: bool,
+    out: Path | None,
+) -> int:
+    """Draw how far off a start may be, by what it is calibrated with (PLK-Calib's Fig. 6, CRLF's Fig. 7).
+
+    Up to 46 deg about the vehicle's up axis, 5 m along its left axis, 6 deg and 1 m on all axes together, for
+    PLK-Calib's methods on lines whose matches are known, for the search for the best semantic cost by
+    Algorithm 1 of CRLF and by evolution, and for the whole of calibwatch calibrate. DIR as for evaluate
+    dataset. Takes some minutes a frame.
+    """
+    from monitor.basin_evaluation import evaluate  # noqa: PLC0415 - numpy is not needed for --help
+    from monitor.basin_tables import basin_picture, basin_text  # noqa: PLC0415 - likewise
+    from monitor.clock import SystemClock  # noqa: PLC0415 - likewise
+    from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
+
+    chosen = _frames_of(places, simulated, frames, (0.0, 0.0), seed)
+    folder = _made(out)
+    found = evaluate(chosen, starts, seed, open_segmenter(model, 1), SystemClock(), _progress)
+    _clear()
+    picture = None if folder is None else basin_picture(found)
+    _deliver(folder, "basin", basin_text(found), found.model_dump_json(indent=1), picture, as_json=as_json)
+    return 0
+
+
+def _frames_of(
+    places: tuple[Path, ...], simulated: int, most: int, reference_sigma: tuple[float, float], seed: int
+) -> "EvaluatedFrames":
+    """The frames of all places and simulated ones; none at all is wrong usage."""
+    import numpy as np  # noqa: PLC0415 - not needed for --help
+
+    from monitor.evaluated_frames import chained, recorded_frames, simulated_frames  # noqa: PLC0415 - likewise
+
+    if not places and not simulated:
+        raise click.UsageError("nothing to calibrate: name a folder, or simulate some frames (--simulated N)")
+    sigma_deg, sigma_m = reference_sigma
+    sigma = np.array([np.radians(sigma_deg)] * 3 + [sigma_m] * 3)
+    parts = [recorded_frames(places, most, sigma, _warn)] if places else []
+    return chained([*parts, *([simulated_frames(simulated, seed)] if simulated else [])])
+
+
+def _warn(note: str) -> None:
+    click.echo(f"warning: {note}", err=True)
 
 
 def _made(out: Path | None) -> Path | None:

@@ -32,6 +32,8 @@ SAME_LINE_SLOPE = 0.05
 """px per px beyond its end: roads bend by some 3 deg over the length of a piece."""
 MODEL_M = 0.015
 """m; paint's bright middle and its painted middle differ, poles taper: common to all points of a line."""
+OUTERMOST = 1e6
+"""m and px; what lies beyond, or is no number, is no line that a sensor saw."""
 
 
 _NODES = 0.5 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * 0.5 / np.sqrt(3.0)
@@ -77,8 +79,11 @@ def associate(
     cost = np.full((len(cloud_lines), len(image_lines)), np.inf)
     cost[rows[:, 0], rows[:, 1]] = _costs(candidates, camera, T_cam_lidar, covariance)
     unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
+    # Of each image line only the best pair may win; the rest is asked of these few alone.
+    best, second = (np.partition(np.vstack([cost, np.full(cost.shape[1], np.inf)]), 1, axis=0))[:2]
+    ahead = (cost <= best) & np.isfinite(cost) & (cost + MARGIN <= second)
     chosen = np.array(
-        [bool(np.isfinite(cost[i, j])) and _wins(cost, image_lines, (i, j), unit) for i, j in rows.tolist()]
+        [bool(ahead[i, j]) and _wins(cost, image_lines, (i, j), unit) for i, j in rows.tolist()]
     )
     matches = tuple(LineMatch(cloud_lines[i], image_lines[j]) for i, j in rows[chosen].tolist())
     return Association(matches, plk.select(candidates, chosen))
@@ -100,19 +105,17 @@ def _costs(pairs: plk.LinePairs, camera: CameraModel, T_cam_lidar: Floats, covar
 
 
 def _wins(cost: Floats, image_lines: Sequence[ImageLine], pair: tuple[int, int], unit: float) -> bool:
-    """Whether a pair beats every other pair of its cloud line and of its image line by the margin.
+    """Whether a pair beats every other pair of its cloud line by the margin.
 
-    Pieces of one image line, one behind the other, are no rivals: each shows its part of the cloud line.
+    Pieces of one image line, one behind the other, are no rivals: each shows its part of the cloud line. Of
+    image lines that are one and the same the first stands for all.
     """
     i, j = pair
-    beaten = cost[i, j] + MARGIN
-    if (np.delete(cost[:, j], i) < beaten).any():
-        return False
-    for other in np.flatnonzero(cost[i] < beaten).tolist():
+    for other in np.flatnonzero(cost[i] < cost[i, j] + MARGIN).tolist():
         if other == j:
             continue
         gap = _gap(image_lines[j], image_lines[other], unit)
-        if gap is None or (gap < 0 and cost[i, other] < cost[i, j]):
+        if gap is None or (gap < 0 and (cost[i, other], other) < (cost[i, j], j)):
             return False
     return True
 
@@ -146,8 +149,15 @@ def pairs_on_overlap(
     Returns:
         Indices (M,2) of cloud and image line, and the M pairs.
     """
+    image_sound = [(j, b.label) for j, b in enumerate(image_lines) if _is_sound(b, b.sigma_px)]
     rows = np.array(
-        [(i, j) for i, a in enumerate(cloud_lines) for j, b in enumerate(image_lines) if a.label == b.label],
+        [
+            (i, j)
+            for i, a in enumerate(cloud_lines)
+            if _is_sound(a, a.sigma_m, a.mean_m or 0.0)
+            for j, label in image_sound
+            if a.label == label
+        ],
         dtype=np.int64,
     ).reshape(-1, 2)
     if len(rows) == 0:
@@ -186,6 +196,16 @@ def pairs_on_overlap(
         noise,
     )
     return rows[enough], plk.select(pairs, enough)
+
+
+def _is_sound(line: CloudLine | ImageLine, *figures: float) -> bool:
+    """Whether a line has two different ends and finite figures, all within reach."""
+    ends = np.concatenate([line.start, line.end])
+    return bool(
+        (np.abs(ends) < OUTERMOST).all()
+        and all(abs(figure) < OUTERMOST for figure in figures)
+        and (line.start != line.end).any()
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

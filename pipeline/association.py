@@ -6,7 +6,7 @@ dropped: a missing line widens the answer, a wrong one bends it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,9 @@ MODEL_M = 0.015
 """m; paint's bright middle and its painted middle differ, poles taper: common to all points of a line."""
 OUTERMOST = 1e6
 """m and px; what lies beyond, or is no number, is no line that a sensor saw."""
+MOST_CLOUD_LINES, MOST_IMAGE_LINES = 100, 400
+"""Lines of one class that are paired, the longest: a street has fewer, a broken mask makes thousands. Bounds
+time and memory."""
 
 
 _NODES = 0.5 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * 0.5 / np.sqrt(3.0)
@@ -149,20 +152,23 @@ def pairs_on_overlap(
     Returns:
         Indices (M,2) of cloud and image line, and the M pairs.
     """
-    image_sound = [(j, b.label) for j, b in enumerate(image_lines) if _is_sound(b, b.sigma_px)]
-    rows = np.array(
+    some_cloud = _longest(
+        cloud_lines, [abs(a.sigma_m) + abs(a.mean_m or 0.0) for a in cloud_lines], MOST_CLOUD_LINES
+    )
+    some_image = _longest(image_lines, [b.sigma_px for b in image_lines], MOST_IMAGE_LINES)
+    pairs_of = np.array(
         [
             (i, j)
-            for i, a in enumerate(cloud_lines)
-            if _is_sound(a, a.sigma_m, a.mean_m or 0.0)
-            for j, label in image_sound
-            if a.label == label
+            for i, a in enumerate(some_cloud)
+            for j, b in enumerate(some_image)
+            if cloud_lines[a].label == image_lines[b].label
         ],
         dtype=np.int64,
     ).reshape(-1, 2)
-    if len(rows) == 0:
-        return rows, NO_PAIRS
-    cloud = _seen_parts([cloud_lines[i] for i in rows[:, 0]], camera, T_cam_lidar)
+    if len(pairs_of) == 0:
+        return pairs_of, NO_PAIRS
+    rows = np.column_stack([np.array(some_cloud)[pairs_of[:, 0]], np.array(some_image)[pairs_of[:, 1]]])
+    cloud = _seen_parts([cloud_lines[i] for i in some_cloud], camera, T_cam_lidar).take(pairs_of[:, 0])
     image = [image_lines[j] for j in rows[:, 1]]
     start = np.stack([line.start for line in image])
     along = np.stack([line.end for line in image]) - start
@@ -198,14 +204,21 @@ def pairs_on_overlap(
     return rows[enough], plk.select(pairs, enough)
 
 
-def _is_sound(line: CloudLine | ImageLine, *figures: float) -> bool:
-    """Whether a line has two different ends and finite figures, all within reach."""
-    ends = np.concatenate([line.start, line.end])
-    return bool(
-        (np.abs(ends) < OUTERMOST).all()
-        and all(abs(figure) < OUTERMOST for figure in figures)
-        and (line.start != line.end).any()
-    )
+def _longest(lines: Sequence[CloudLine | ImageLine], figures: Sequence[float], most: int) -> list[int]:
+    """Indices, in their order, of lines with two ends and a finite figure; of each class the longest."""
+    if not lines:
+        return []
+    ends = np.stack([np.concatenate([line.start, line.end]) for line in lines])
+    sound = (np.abs(ends) < OUTERMOST).all(axis=1) & (np.abs(figures) < OUTERMOST)
+    first, last = np.split(np.where(sound[:, None], ends, 0.0), 2, axis=1)
+    length = np.linalg.norm(last - first, axis=1)
+    label = np.array([line.label for line in lines])
+    rank = np.zeros(len(lines), dtype=np.int64)
+    order = np.argsort(-length, kind="stable")
+    for kind in np.unique(label):
+        own = order[label[order] == kind]
+        rank[own] = np.arange(len(own))
+    return np.flatnonzero((length > 0.0) & (rank < most)).tolist()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,6 +248,9 @@ class _SeenParts:
     direction: Floats
     offset: Floats
     course: Floats
+
+    def take(self, index: NDArray[np.int64]) -> "_SeenParts":
+        return _SeenParts(*(getattr(self, part.name)[index] for part in fields(self)))
 
 
 def _seen_parts(lines: Sequence[CloudLine], camera: CameraModel, T_cam_lidar: Floats) -> _SeenParts:

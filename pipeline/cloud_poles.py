@@ -42,6 +42,8 @@ RING_SHARE = 0.1
 MIN_POLE_POINTS = 8
 MIN_LEVELS = 4
 """Height bins of 0.15 m with returns, at least: a line needs more than two rings."""
+MOST_CANDIDATES = 300
+"""Candidates looked at, those of most returns: a street has some dozens, a forest thousands."""
 _LEVEL_M = 0.15
 _POLE_REFITS = 3
 """Rounds of fit and trim; the third changes no point in practice."""
@@ -82,8 +84,9 @@ def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> li
     returns = _Returns(
         index, cloud.xyz[index].astype(np.float64), plan, np.asarray(height[index], dtype=np.float64)
     )
+    candidates = _pole_candidates(returns, ground.offset, _top_slope(cloud, ground, basis))
     poles = []
-    for members in _pole_candidates(returns, ground.offset, _top_slope(cloud, ground, basis)):
+    for members in sorted(candidates, key=len, reverse=True)[:MOST_CANDIDATES]:
         line = _pole(returns, ground, members)
         if line is not None:
             poles.append(line)

@@ -30,6 +30,9 @@ CORE = 0.5
 """Of the depth of a stroke; what lies deeper is its core, in which straight pieces are sought."""
 MIN_FRESH = 0.5
 """Share of a Hough segment that no earlier line has claimed, at least."""
+MOST_PIECES = 100
+"""Pieces of one mask, before the lens is straightened and after, the longest: a street has some dozens, a
+broken mask makes thousands. Bounds the time."""
 STATION_PX = 1.5
 """px along the line from one cross-section to the next; nearer ones share their pixels."""
 MAX_STATIONS = 200
@@ -163,6 +166,8 @@ def _segments(
         widths = float(np.median(width[:third])), float(np.median(width[-third:]))
         cv2.line(claimed, _pixel(start), _pixel(end), 1, max(3, math.ceil(1.5 * max(widths) * grid)))
         segments.append(((start + 0.5) / scale - 0.5, (end + 0.5) / scale - 0.5, widths))
+        if len(segments) == MOST_PIECES:
+            break
     return segments
 
 
@@ -295,7 +300,7 @@ def _fit(points: Floats, unit: float) -> _Stroke | None:
 
 def _merged(strokes: list[_Stroke], unit: float) -> list[_Stroke]:
     """Pieces of one line joined: dashes, and what a mask's hole or Hough's tolerance had split."""
-    waiting = sorted(strokes, key=lambda stroke: -stroke.length)
+    waiting = sorted(strokes, key=lambda stroke: -stroke.length)[:MOST_PIECES]
     merged: list[_Stroke] = []
     while waiting:
         line = waiting.pop(0)

@@ -128,12 +128,12 @@ def coarse_extrinsic(
     if isinstance(found, NoTriples):
         return NoCoarse(found.reason)
     some = SemanticPoints(_spread(points.lane, p.points), _spread(points.pole, p.points))
-    scores = semantic_cost(found.T_cam_lidar, some, _above_chance(maps, _SEEK), camera)
+    scores = semantic_cost(found.T_cam_lidar, some, above_chance(maps, SEEK), camera)
     order = np.argsort(-scores, kind="stable")[:_SHORTLIST]
     apart = order[_distinct(found.T_cam_lidar[order], p)][: _RIVALS * p.finalists]
     frame = _Frame(_longest(cloud_lines, p.all_lines), _longest(image_lines, p.all_lines), camera)
     fits = [_Fit(found.T_cam_lidar[k], _own_lines(lines, found, int(k), camera)) for k in apart]
-    chance = _above_chance(maps, _SETTLE)
+    chance = above_chance(maps, SETTLE)
     drawn = [_drawn_in(fit, frame) for fit in fits[: p.finalists]]
     fits = [*_kept(fits[: p.finalists], drawn, points, chance, camera), *fits[p.finalists :]]
     best = int(np.argmax(semantic_cost(_extrinsics(fits), points, chance, camera)))
@@ -159,12 +159,12 @@ def coarse_extrinsic(
 
 _CHANCE = 0.5
 """Height at which a point in view says nothing; nearer to a mask it speaks for a candidate, else against."""
-_SEEK, _SETTLE = 3, 5
+SEEK, SETTLE = 3, 5
 """Powers of the heights: points say nothing 11 px or 1 deg beside a mask while triples of noisy lines
 compete, and 7 px after all lines have drawn them in."""
 
 
-def _above_chance(maps: HeightMaps, power: int) -> HeightMaps:
+def above_chance(maps: HeightMaps, power: int) -> HeightMaps:
     """Maps so many times steeper, by which points out of view count as chance and not as misses.
 
     A LiDAR that turns fully sees the road behind as well. By J itself the best camera is one far behind the

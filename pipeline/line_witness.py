@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
-from pipeline import plk, se3
+from pipeline import line_doubt, plk, se3
 from pipeline.association import NO_PAIRS, Association, associate
 from pipeline.cameras import undistort
 from pipeline.cloud_lanes import find_lanes
@@ -34,10 +35,14 @@ FLOOR_SIGMA = np.array([np.radians(0.1)] * 3 + [0.03] * 3)
 """rad and m; lines are matched again at least this wide: what the noise model does not know of."""
 ROUNDS = 3
 """Matching and solving in turn; the pairs no longer change after the second on simulated streets."""
+_FAINT = 1e-6
+"""Share of the prior's precision that keeps unseen directions in place and pulls no seen one."""
 MIN_FREEDOM = 0.5
 """Distances measured beyond those that the answer needs; without any a wrong pair looks like drift."""
 FRAME_CORRELATION = 0.5
 """Correlation of the errors of neighbouring frames (FORMULAS F1): 10 frames of a street are worth some 4."""
+TRACK_M = 0.5
+"""m; aside, from frame to frame: a lane's distance changes by so much in a second of weaving or bending."""
 VIEW_MARGIN = 0.1
 """Share of the field of view around the image searched for cloud lines: more than the prior moves them."""
 MIN_DEPTH_M = 1.0
@@ -52,11 +57,13 @@ class LineFrame:
         cloud_lines: In the LiDAR frame; lane lines run along ``forward``, poles from foot to top.
         image_lines: In ideal px.
         reasons: Why a kind of line could not be looked for; empty where all could.
+        aside: float64 (3,), unit, LiDAR frame: to the left or right of the way.
     """
 
     cloud_lines: tuple[CloudLine, ...]
     image_lines: tuple[ImageLine, ...]
     reasons: tuple[str, ...]
+    aside: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,10 +73,12 @@ class LineSolution:
     Attributes:
         estimate: Against the stored extrinsic; information zero where nothing was matched.
         matches: Per frame, the pairs that took part.
+        fit: Probability that right pairs fit each other worse than these, 0..1; 1 where nothing was said.
     """
 
     estimate: WitnessEstimate
     matches: tuple[tuple[LineMatch, ...], ...]
+    fit: float
 
 
 def find_lines(
@@ -113,7 +122,13 @@ def find_lines(
         lanes = find_lanes(cloud, ground, seen, rng)
         lines += [with_arc(_along(line, forward), cloud) for line in lanes]
         lines += find_poles(cloud, ground, seen)
-    return LineFrame(tuple(lines), tuple(find_image_lines(image, masks, camera)), tuple(reasons))
+    aside = np.cross(up, forward)
+    return LineFrame(
+        tuple(lines),
+        tuple(find_image_lines(image, masks, camera)),
+        tuple(reasons),
+        aside / np.linalg.norm(aside),
+    )
 
 
 def _along(line: CloudLine, direction: Floats) -> CloudLine:
@@ -145,38 +160,132 @@ def in_view(cloud: PointCloud, camera: CameraModel, T_cam_lidar: Floats) -> NDAr
     return np.asarray(inside)
 
 
-def solve_lines(frames: Sequence[LineFrame], camera: CameraModel, T_stored: Floats) -> LineSolution:
-    """One extrinsic from the lines of all frames of a window.
+def solve_lines(
+    frames: Sequence[LineFrame], camera: CameraModel, T_stored: Floats, prior_sigma: Floats = PRIOR_SIGMA
+) -> LineSolution:
+    """One extrinsic from the lines of all frames of a window, or of one frame.
 
     Matching and solving take turns, from the prior around the stored extrinsic to the posterior of the
     solution. The prior keeps unobserved directions in place while solving; its pull is taken out of the
-    answer again, linearised at the solution. The same pole in 20 frames is not 20 poles: the information is
-    that of ``effective_frames`` frames, divided by chi2 where residuals exceed their model, and by
-    a little more where chi2 itself rests on few lines.
+    answer again, linearised at the solution. Groups of pairs that the others contradict are left out, and
+    what remains of doubt about the rest widens the answer (``line_doubt``). The same pole in 20 frames is not
+    20 poles: the information is that of ``effective_frames`` frames, divided by chi2 where residuals exceed
+    their model, and by a little more where chi2 itself rests on few lines.
 
     Args:
         frames: Lines of each frame.
         camera: Intrinsics.
         T_stored: float64 (4,4), the stored extrinsic.
+        prior_sigma: float64 (6,), rad and m, how far off it may be per axis. A wider prior makes more pairs
+            ambiguous; what then rests on too few of them is held.
 
     Returns:
         The estimate and the pairs; nothing matched, or no pair more than needed to check the others, gives no
         information and no features.
     """
-    prior = plk.Prior(T_stored, np.diag(PRIOR_SIGMA**-2.0))
-    T, covariance = T_stored, np.diag(PRIOR_SIGMA**2)
-    result = LineSolution(_nothing(), tuple(() for _ in frames))
+    prior = plk.Prior(T_stored, np.diag(prior_sigma**-2.0))
+    T = T_stored
+    covariance: Floats = np.diag(prior_sigma**2)
+    result = _silence(len(frames))
     for _ in range(ROUNDS):
         found = [associate(frame.cloud_lines, frame.image_lines, camera, T, covariance) for frame in frames]
         pairs = plk.stack([part.pairs for part in found] or [NO_PAIRS])
         if len(pairs) == 0:
-            return LineSolution(_nothing(), tuple(() for _ in frames))
-        solution = plk.method_one(pairs, camera.K, T, prior=prior)
-        result = LineSolution(_estimate(solution, found, T_stored), tuple(part.matches for part in found))
+            return _silence(len(frames))
+        round_ = _consistent(_Round(found, pairs, _groups(frames, found)), camera, T, prior)
+        solution = round_.solution
+        assert solution is not None  # noqa: S101 - _consistent solves
+        result, belief = _answer(round_, camera, prior)
         T = solution.T_cam_lidar
-        worth = _worth(found, solution)
-        covariance = np.linalg.inv(worth * solution.information + prior.precision) + np.diag(FLOOR_SIGMA**2)
+        covariance = np.linalg.inv(belief.precision) + np.diag(FLOOR_SIGMA**2)
     return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Round:
+    """Pairs of one round of matching, in the order of the frames and their matches.
+
+    Attributes:
+        found: Per frame.
+        pairs: N of all frames.
+        group: int64 (N,), pairs that would be wrong together.
+        solution: Of method I, where it was asked for.
+    """
+
+    found: Sequence[Association]
+    pairs: plk.LinePairs
+    group: NDArray[np.int64]
+    solution: plk.Solution | None = None
+
+    @property
+    def frames(self) -> int:
+        return sum(1 for part in self.found if part.matches)
+
+    def without(self, group: int) -> "_Round":
+        """The round without one group."""
+        kept = self.group != group
+        first, found = 0, []
+        for part in self.found:
+            own = kept[first : first + len(part.matches)]
+            first += len(part.matches)
+            matches = tuple(match for match, keep in zip(part.matches, own, strict=True) if keep)
+            found.append(Association(matches, plk.select(part.pairs, own)))
+        _, left = np.unique(self.group[kept], return_inverse=True)
+        return _Round(found, plk.select(self.pairs, kept), left.astype(np.int64))
+
+
+def _groups(frames: Sequence[LineFrame], found: Sequence[Association]) -> NDArray[np.int64]:
+    """Group (N,) of each pair: those of one cloud line, and of cloud lines that pass at one distance aside.
+
+    While the vehicle moves on, a line or pole stays at its distance to the left or right: a wrong pair
+    comes back frame by frame.
+    """
+    places: list[tuple[str, float]] = []
+    keys: list[int] = []
+    for index, (frame, part) in enumerate(zip(frames, found, strict=True)):
+        for match in part.matches:
+            line = match.cloud
+            middle = float(0.5 * (line.start + line.end) @ frame.aside)
+            same = [
+                k
+                for k, (label, other) in enumerate(places)
+                if label == line.label and abs(other - middle) < TRACK_M
+            ]
+            if index == 0 or not same:
+                known = (line.label, middle)
+                if known not in places:
+                    places.append(known)
+                keys.append(places.index(known))
+            else:
+                nearest = min(same, key=lambda k: abs(places[k][1] - middle))
+                places[nearest] = (line.label, middle)
+                keys.append(nearest)
+    return np.unique(np.array(keys, dtype=np.int64), return_inverse=True)[1].astype(np.int64)
+
+
+def _consistent(round_: _Round, camera: CameraModel, T: Floats, prior: plk.Prior) -> _Round:
+    """The round without groups that the others contradict, solved."""
+    while True:
+        solution = plk.method_one(round_.pairs, camera.K, T, prior=prior)
+        solved = _Round(round_.found, round_.pairs, round_.group, solution)
+        groups, belief = _linearised(solved, camera, prior)
+        others = line_doubt.without_each(groups, belief)
+        odds = line_doubt.odds_wrong(groups, belief, others)
+        worst = int(odds.argmax())
+        if odds[worst] <= 0.0 or len(odds) == 1:
+            return solved
+        round_ = round_.without(worst)
+
+
+def _linearised(
+    round_: _Round, camera: CameraModel, prior: plk.Prior
+) -> tuple[line_doubt.Quadratic, line_doubt.Belief]:
+    """The groups around the solution, worth the effective frames, and the prior there."""
+    assert round_.solution is not None  # noqa: S101 - solved before
+    T = round_.solution.T_cam_lidar
+    groups = line_doubt.quadratic(round_.pairs, round_.group, camera.K, T)
+    belief = line_doubt.Belief(-se3.local(prior.T_cam_lidar, T), prior.precision)
+    return groups.scaled(effective_frames(round_.frames) / round_.frames), belief
 
 
 def effective_frames(count: int) -> float:
@@ -185,39 +294,45 @@ def effective_frames(count: int) -> float:
     return count / (1.0 + 2.0 * float(((1.0 - lag / count) * FRAME_CORRELATION**lag).sum()))
 
 
-def _worth(found: Sequence[Association], solution: plk.Solution) -> float:
-    """Factor on the information: effective over counted frames, over the misfit and the doubt about it.
+def _misfit(solution: plk.Solution) -> float:
+    """Factor on the covariance: chi2 where residuals exceed their model, and the doubt about it.
 
     A misfit judged by n degrees of freedom is itself known to sqrt(2 / n) only: the answer's tails are those
     of Student's t, whose variance is larger by 1 + 2 / n to first order.
     """
-    count = sum(1 for part in found if part.matches)
-    doubt = 1.0 + 2.0 / max(solution.freedom, MIN_FREEDOM)
-    return effective_frames(count) / count / max(1.0, solution.chi2) / doubt
+    return max(1.0, solution.chi2) * (1.0 + 2.0 / max(solution.freedom, MIN_FREEDOM))
 
 
-def _nothing() -> WitnessEstimate:
-    return WitnessEstimate("lines", np.zeros(6), np.zeros((6, 6)), 0, 0, 1.0)
+def _silence(frames: int) -> LineSolution:
+    nothing = WitnessEstimate("lines", np.zeros(6), np.zeros((6, 6)), 0, 0, 1.0)
+    return LineSolution(nothing, tuple(() for _ in range(frames)), 1.0)
 
 
-def _estimate(solution: plk.Solution, found: Sequence[Association], T_stored: Floats) -> WitnessEstimate:
+def _answer(round_: _Round, camera: CameraModel, prior: plk.Prior) -> tuple[LineSolution, line_doubt.Belief]:
     """The lines' own answer: prior taken out, directions held that they do not know (FORMULAS D3)."""
-    scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
-    worth = _worth(found, solution)
-    values, V = np.linalg.eigh(worth * solution.information * scale)
+    solution = round_.solution
+    assert solution is not None  # noqa: S101 - solved before
+    groups, stored = _linearised(round_, camera, prior)
+    odds = line_doubt.odds_wrong(groups, stored, line_doubt.without_each(groups, stored))
+    groups = groups.scaled(1.0 / _misfit(solution))
+    belief = line_doubt.doubted(groups, stored, odds)
+    sigma = 1.0 / np.sqrt(np.diag(prior.precision))
+    values, V = np.linalg.eigh((belief.precision - prior.precision) * np.outer(sigma, sigma))
     known = values >= HELD_SIGMAS**-2.0
+    matches = tuple(part.matches for part in round_.found)
     if solution.freedom < MIN_FREEDOM or not known.any():
-        return _nothing()
+        return LineSolution(_silence(0).estimate, matches, 1.0), belief
     values, V = values[known], V[:, known]
-    xi_map = se3.local(T_stored, solution.T_cam_lidar)
-    pull = worth * (solution.information @ xi_map + solution.gradient) * PRIOR_SIGMA
-    xi = PRIOR_SIGMA * (V @ ((V.T @ pull) / values))
-    information = (V * values) @ V.T / scale
-    return WitnessEstimate(
+    # Without the prior, or its pull would be in the answer.
+    own = line_doubt.posterior(groups, line_doubt.Belief(stored.mean, _FAINT * prior.precision))
+    information = (V * values) @ V.T / np.outer(sigma, sigma)
+    estimate = WitnessEstimate(
         "lines",
-        xi,
+        sigma * (V @ (V.T @ ((own.mean - stored.mean) / sigma))),
         0.5 * (information + information.T),
-        sum(1 for part in found if part.matches),
-        sum(len(part.matches) for part in found),
+        round_.frames,
+        len(round_.pairs),
         solution.chi2,
     )
+    freedom = solution.freedom * effective_frames(round_.frames) / round_.frames
+    return LineSolution(estimate, matches, float(chdtrc(freedom, freedom * solution.chi2))), belief

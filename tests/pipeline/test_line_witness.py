@@ -28,11 +28,12 @@ _spec.loader.exec_module(scenes)
 
 LIMITS = np.array([*np.radians([0.75, 0.5, 0.5]), 0.20, 0.15, 0.15])
 R_VC = se3.AXES_CAM_IN_VEHICLE
+ASIDE = np.cross(scenes.UP, scenes.FORWARD)
 
 
 def frame(rng, **kwargs):
     cloud, image = scenes.line_sets(rng, **kwargs)
-    return LineFrame(tuple(cloud), tuple(image), ())
+    return LineFrame(tuple(cloud), tuple(image), (), ASIDE)
 
 
 def in_axes(estimate):
@@ -120,8 +121,8 @@ def test_nothing_matched_is_no_information(kind):
     lanes, poles = frame(rng, poles=[]), frame(rng, lanes=[])
     frames = {
         "no frames": [],
-        "empty frames": [LineFrame((), (), ("no ground plane in the cloud",))] * 3,
-        "nothing alike": [LineFrame(lanes.cloud_lines, poles.image_lines, ())],
+        "empty frames": [LineFrame((), (), ("no ground plane in the cloud",), ASIDE)] * 3,
+        "nothing alike": [LineFrame(lanes.cloud_lines, poles.image_lines, (), ASIDE)],
     }[kind]
     estimate = solve_lines(frames, scenes.CAMERA, scenes.TRUTH).estimate
     assert estimate.features == estimate.frames == 0
@@ -143,7 +144,7 @@ def test_two_lanes_can_not_check_each_other_and_three_can():
 def test_a_frame_without_lines_changes_nothing():
     rng = np.random.default_rng(6)
     frames = [frame(rng) for _ in range(3)]
-    with_empty = solve_lines([*frames, LineFrame((), (), ())], scenes.CAMERA, scenes.TRUTH)
+    with_empty = solve_lines([*frames, LineFrame((), (), (), ASIDE)], scenes.CAMERA, scenes.TRUTH)
     alone = solve_lines(frames, scenes.CAMERA, scenes.TRUTH)
     assert np.array_equal(with_empty.estimate.xi, alone.estimate.xi)
     assert with_empty.matches[3] == ()
@@ -172,10 +173,10 @@ def test_misfit_widens_the_answer():
     honest, rough = [], []
     for _ in range(8):
         cloud, image = scenes.line_sets(rng, sigma_px=0.5)
-        honest.append(LineFrame(tuple(cloud), tuple(image), ()))
+        honest.append(LineFrame(tuple(cloud), tuple(image), (), ASIDE))
         cloud, image = scenes.line_sets(rng, sigma_px=3.0)
         claimed = [type(line)(line.label, line.start, line.end, 0.5) for line in image]
-        rough.append(LineFrame(tuple(cloud), tuple(claimed), ()))
+        rough.append(LineFrame(tuple(cloud), tuple(claimed), (), ASIDE))
     fine, poor = (solve_lines(frames, scenes.CAMERA, scenes.TRUTH).estimate for frames in (honest, rough))
     assert fine.chi2 < 1.5 < poor.chi2
     assert (np.diag(poor.information) < np.diag(fine.information)).all()
@@ -288,7 +289,7 @@ def bright_strokes(pixels):
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize(("name", "tolerance"), [("000005", 0.15), ("000009", 0.45)])
+@pytest.mark.parametrize(("name", "tolerance"), [("000005", 0.2), ("000009", 0.45)])
 @pytest.mark.parametrize("yaw_deg", [0.0, -0.7])
 def test_lanes_of_one_real_frame_give_pitch_and_yaw(name, tolerance, yaw_deg):
     """The published extrinsic is good to 0.1 to 0.2 deg; 000009 is one bent road."""

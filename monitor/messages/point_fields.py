@@ -2,8 +2,8 @@
 
 Field names are compared in lower case. What a field means is settled here and nowhere else:
 
-- ``x y z``: metres. Points that are not finite and returns at exactly (0, 0, 0), by which sensors mark a
-  beam without an echo, are dropped from every array together.
+- ``x y z``: metres. Points that are not finite or out of every sensor's reach, and returns at exactly
+  (0, 0, 0), are dropped from every array together: so sensors and drivers mark a beam without an echo.
 - intensity (:data:`INTENSITY`, the first that exists): 0..1. uint8 is divided by 255. Floats of which 99 %
   are at most 1 stand as they are. Anything else is divided by 255 or, where it is larger (signal counts), by
   the 99.9 % quantile; then all is clipped to 0..1. Quantiles of the valid points, not the largest value:
@@ -34,6 +34,9 @@ TIME = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
 
 KNOWN = frozenset(("x", "y", "z", *INTENSITY, *RING, *TIME))
 """Fields that :func:`cloud_of` reads; the others need not even be of a type that is known."""
+
+FARTHEST_M = 1e4
+"""m on each axis; no LiDAR reaches so far. Larger numbers stand for no echo and would overflow in squares."""
 
 NOMINAL_SHARE = 0.99
 """Share of points within 0..1 that tells a scale of 0..1; retroreflectors are some tenths of a percent."""
@@ -151,7 +154,8 @@ def cloud_of(columns: Mapping[str, Column], stamp_ns: int) -> PointCloud:
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf, which is dropped
         for axis, name in enumerate("xyz"):
             xyz[:, axis] = columns[name]
-    keep = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    with np.errstate(invalid="ignore"):  # what is not finite is not within reach either
+        keep = np.logical_and.reduce([np.abs(xyz[:, axis]) <= FARTHEST_M for axis in range(3)])
     keep &= (xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0)
     if keep.all():
         chosen: NDArray[np.intp] | slice = slice(None)

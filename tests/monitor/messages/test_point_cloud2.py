@@ -100,9 +100,9 @@ def test_invalid_points_leave_every_array_together():
     assert cloud.time == pytest.approx([0.0, 0.05])
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1.1e4, -3e38])
 @pytest.mark.parametrize("axis", "xyz")
-def test_one_coordinate_that_is_not_finite_drops_the_point(axis, value):
+def test_one_coordinate_that_is_no_place_drops_the_point(axis, value):
     columns = with_xyz(intensity=np.array([0.1, 0.2])) | {axis: np.array([value, 2])}
     assert cloud_of(columns, [*LAYOUTS["x y z"], ("intensity", "f4")]).xyz.tolist() == [[2, 2, 2]]
 

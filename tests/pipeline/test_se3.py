@@ -227,3 +227,14 @@ class TestSigns:
     def test_camera_that_looks_left(self, axis, point, component, sign, R_vehicle_lidar):
         before, after = self.moved(axis, LEFT, point, R_vehicle_lidar)
         assert sign * (after - before)[component] > 0.09
+
+
+@given(POSE, TURN, SHIFT)
+def test_the_distance_of_two_extrinsics_is_that_of_the_step_between_them(T, phi, shift):
+    """CRLF (15), (16), half turns among them, where the axis of the difference is lost."""
+    R = se3.exp_so3(phi) @ T[:3, :3]
+    other = se3.transform(R, T[:3, 3] + shift)
+    for one, two in ((T, other), (other, T)):
+        distance, angle = se3.pose_error(one, two)
+        assert distance == pytest.approx(np.linalg.norm(shift), abs=1e-9)
+        assert angle == pytest.approx(np.linalg.norm(phi), abs=1e-6)

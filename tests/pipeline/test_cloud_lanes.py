@@ -93,13 +93,44 @@ def test_one_laser_that_reads_bright_paints_no_line(middle):
     assert found(PointCloud(cloud.xyz, intensity), rng) == []
 
 
-def test_a_stop_line_across_the_road_is_found():
+@pytest.mark.parametrize("slant_deg", [0.0, 30.0, 45.0])
+def test_lines_aslant_to_the_view_are_found(slant_deg):
     rng = np.random.default_rng(9)
     cloud = scenes.sampled_cloud(rng, lanes=[], poles=[], rings_deg=0.2)
-    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
-    on = (np.abs(x - 11.0) < 0.15) & (np.abs(y) < 6.0)
+    way = np.array([np.cos(np.radians(slant_deg)), np.sin(np.radians(slant_deg))])
+    offset = cloud.xyz[:, :2].astype(np.float64) - [11.0, 0.0]
+    on = (np.abs(offset @ [-way[1], way[0]]) < 0.1) & (np.abs(offset @ way) < 5.0)
     (line,) = found(PointCloud(cloud.xyz, np.where(on, 0.6, cloud.intensity).astype(np.float32)), rng)
-    assert off_axis(line, np.array([11.0, -6, -1.73]), np.array([11.0, 6, -1.73])) < 0.15
+    ends = np.array([11.0, 0.0, -1.73]) + np.array([[-5.0], [5.0]]) * [*way, 0.0]
+    assert off_axis(line, *ends) < 0.1
+
+
+def weak(cloud, seed, *, noise, gain):
+    """Paint hardly brighter than the road, lasers of unlike gain, echoes that fade with range."""
+    rng = np.random.default_rng(seed)
+    reach = np.linalg.norm(cloud.xyz, axis=1)
+    ring = np.unique(np.round(np.arcsin(cloud.xyz[:, 2] / reach), 3), return_inverse=True)[1]
+    gains = np.exp(rng.normal(0.0, gain, ring.max() + 1))[ring]
+    shade = cloud.intensity * gains * np.exp(-reach / 30.0) * np.exp(rng.normal(0.0, noise, len(ring)))
+    return PointCloud(cloud.xyz, np.round(shade, 2).astype(np.float32), ring.astype(np.uint16))
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_weak_paint_under_unlike_lasers_is_found(numbered):
+    rng = np.random.default_rng(10)
+    cloud = weak(scenes.sampled_cloud(rng, noise=0.005), 10, noise=0.4, gain=0.25)
+    lanes = found(cloud if numbered else PointCloud(cloud.xyz, cloud.intensity), rng)
+    assert len({partner(line, scenes.lane_ends())[0][1] for line in lanes}) >= (4 if numbered else 3)
+    for line in lanes:
+        assert off_axis(line, *partner(line, scenes.lane_ends())) < 0.15
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_unlike_lasers_paint_no_line_on_a_bare_road(seed):
+    rng = np.random.default_rng(seed)
+    cloud = weak(scenes.sampled_cloud(rng, lanes=[], noise=0.005), seed, noise=0.4, gain=0.4)
+    assert found(cloud, rng) == []
+    assert found(PointCloud(cloud.xyz, cloud.intensity), rng) == []
 
 
 @pytest.mark.parametrize("thing", ["patch", "verge", "cover"])

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from monitor.clock import Clock
-from monitor.dataset_evaluation import Stopwatch, calibrated
 from monitor.evaluated_frames import EvaluatedFrame, EvaluatedFrames
+from monitor.frame_calibration import Stopwatch, calibrated
 from pipeline import basin, se3
 from pipeline.association import associate
 from pipeline.basin import OFFSETS, BasinScene, Sweep

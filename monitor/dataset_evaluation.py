@@ -1,25 +1,23 @@
 """``calibwatch evaluate dataset``: frames calibrated one by one from starts that are off by known amounts."""
 
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from monitor.clock import Clock
+from monitor.coarse_evaluation import Coarse, CoarseSummary, coarse_of, coarse_summary
 from monitor.evaluated_frames import EvaluatedFrame, EvaluatedFrames
+from monitor.frame_calibration import Stopwatch, calibrated, drawn_start, errors_of
 from monitor.statements import TO_PEOPLE
 from monitor.status import AXIS_NAMES, AxisName
 from pipeline import se3
-from pipeline.calibration import Calibrated, CalibrationParameters, Calibrator
+from pipeline.calibration import Calibrated
 from pipeline.error_statistics import CONFIDENT_SIGMAS, beyond, honesty, mean_absolute
-from pipeline.parameters import Parameters
 from pipeline.records import Floats
 from pipeline.segmentation import Segmenter
-from pipeline.watch import Mount
 
 Progress = Callable[[str, int, int], None]
 """Is told what is calibrated, how many are done, and of how many."""
@@ -132,7 +130,10 @@ class Dataset(_Values):
     translation_m: float
     seed: int
     summaries: tuple[Summary, ...]
+    coarse_summaries: tuple[CoarseSummary, ...]
     answers: tuple[Answer, ...]
+    coarse: tuple[Coarse, ...]
+    """Of each frame, without a prior."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,28 +148,10 @@ class _Run:
     reference_sigma: Floats
 
 
-@dataclass(slots=True)
-class Stopwatch:
-    """Adds up how long stages take, ms."""
-
-    clock: Clock
-    ms: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Times one stage."""
-        begun = self.clock.monotonic_ns()
-        try:
-            yield
-        finally:
-            took = (self.clock.monotonic_ns() - begun) / 1e6
-            self.ms[name] = self.ms.get(name, 0.0) + took
-
-
 def evaluate(
     frames: EvaluatedFrames, segmenter: Segmenter, options: Options, clock: Clock, progress: Progress
 ) -> Dataset:
-    """Calibrates every frame from every start, by what ``calibwatch calibrate`` runs.
+    """Calibrates every frame from every start by what ``calibwatch calibrate`` runs, and without a prior.
 
     Args:
         frames: With their true extrinsics.
@@ -178,41 +161,29 @@ def evaluate(
         progress: Told each answer.
     """
     runs: list[_Run] = []
+    coarse: list[Coarse] = []
     for frame in frames:
+        coarse.append(coarse_of(frame, segmenter, options.seed, clock))
         for start in range(options.starts):
             runs.append(_run(frame, start, segmenter, options, clock))
             progress(frame.name, len(runs), len(frames) * options.starts)
     groups = list(dict.fromkeys(run.answer.group for run in runs))
-    summaries = [_summary(group, [run for run in runs if run.answer.group == group]) for group in groups]
-    if len(groups) > 1:
-        summaries.append(_summary("all", runs))
+    sets = {group: {group} for group in groups} | ({"all": set(groups)} if len(groups) > 1 else {})
     return Dataset(
         starts=options.starts,
         rotation_deg=options.rotation_deg,
         translation_m=options.translation_m,
         seed=options.seed,
-        summaries=tuple(summaries),
+        summaries=tuple(
+            _summary(name, [run for run in runs if run.answer.group in those]) for name, those in sets.items()
+        ),
+        coarse_summaries=tuple(
+            coarse_summary(name, [one for one in coarse if one.group in those])
+            for name, those in sets.items()
+        ),
         answers=tuple(run.answer for run in runs),
+        coarse=tuple(coarse),
     )
-
-
-def drawn_start(frame: EvaluatedFrame, start: int, widest: Floats, seed: int) -> Floats:
-    """Drift (6,) of a start: uniform on each axis; the same for a frame whatever is evaluated beside it."""
-    rng = np.random.default_rng([seed, zlib.crc32(frame.name.encode()), start])
-    return np.asarray(rng.uniform(-1.0, 1.0, 6) * widest, dtype=np.float64)
-
-
-def errors_of(frame: EvaluatedFrame, T_cam_lidar: Floats) -> Floats:
-    """Motion of the mount from the truth to an extrinsic, (6,), rad and m: 0 where it is right."""
-    truth = frame.mount
-    return se3.mount_drift(truth.T_cam_lidar, T_cam_lidar, truth.R_vehicle_cam)
-
-
-def calibrated(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, times: Stopwatch) -> Calibrated:
-    """What ``calibwatch calibrate`` makes of a frame from the extrinsic of a mount as first guess."""
-    calibrator = Calibrator(mount, Parameters(), segmenter, CalibrationParameters())
-    calibrator.step(frame.pair, times.stage)
-    return calibrator.finish(times.stage)
 
 
 def _run(frame: EvaluatedFrame, start: int, segmenter: Segmenter, options: Options, clock: Clock) -> _Run:

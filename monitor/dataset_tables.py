@@ -1,10 +1,12 @@
 """An evaluation of single frames as Markdown and as a picture, for people."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from monitor.charts import Axis, Curve, Panel, decades, png, steps
+from monitor.coarse_evaluation import NEAR_DEG, NEAR_M
 from monitor.dataset_evaluation import Answer, Dataset
 from monitor.status import AXIS_NAMES, AxisName
 from pipeline.error_statistics import CONFIDENT_SIGMAS
@@ -12,7 +14,7 @@ from pipeline.error_statistics import CONFIDENT_SIGMAS
 _COLUMNS: tuple[AxisName, ...] = ("forward", "left", "up", "roll", "pitch", "yaw")
 """In the order of CRLF's Table II."""
 
-LEGEND = ("start", "refined")
+LEGEND = ("start", "refined", "coarse, no prior")
 
 
 def dataset_text(found: Dataset) -> str:
@@ -24,6 +26,8 @@ def dataset_text(found: Dataset) -> str:
             *_errors(found),
             "",
             *_trust(found),
+            "",
+            *_coarse(found),
             "",
             *_frames(found),
             "",
@@ -49,7 +53,10 @@ def _errors(found: Dataset) -> Iterator[str]:
         "| (15), m | (16), deg |"
     )
     yield "|---|---|---|---|---|---|---|---|---|---|---|---|"
-    for one in found.summaries:
+    for one, coarse in zip(found.summaries, found.coarse_summaries, strict=True):
+        head = f"| {one.group} | {one.frames} | {coarse.found}"
+        medians = f"{_number(coarse.translation_m)} | {_number(coarse.rotation_deg)}"
+        yield f"{head} | coarse, no prior | {_means(coarse.mean_absolute)} | {medians} |"
         head = f"| {one.group} | {one.frames} | {one.answers}"
         medians = f"{one.start_translation_m:.3f} | {one.start_rotation_deg:.3f}"
         yield f"{head} | start | {_means(one.start)} | {medians} |"
@@ -98,6 +105,31 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
+def _coarse(found: Dataset) -> Iterator[str]:
+    yield (f"Coarse, by nothing but intrinsics. *Near*: within {NEAR_DEG:g} deg (16) and {NEAR_M:g} m (15).")
+    yield ""
+    yield "| set | frames | found | near | far | reasons of the others |"
+    yield "|---|---|---|---|---|---|"
+    for one in found.coarse_summaries:
+        reasons = Counter(
+            each.reason for each in found.coarse if not each.found and one.group in (each.group, "all")
+        )
+        said = ", ".join(f"{count}: {reason}" for reason, count in reasons.most_common()) or "-"
+        yield (f"| {one.group} | {one.frames} | {one.found} | {one.near} | {one.found - one.near} | {said} |")
+    far = [each for each in found.coarse if each.found and not each.near]
+    if far:
+        yield ""
+        yield "Far: " + ", ".join(
+            f"{_title(each.group, each.frame)} ({_number(each.rotation_deg)} deg, "
+            f"{_number(each.translation_m)} m)"
+            for each in far
+        )
+
+
+def _title(group: str, frame: str) -> str:
+    return frame if frame.startswith(group) else f"{group} {frame}"
+
+
 def _frames(found: Dataset) -> Iterator[str]:
     yield "Error / sigma of each answer; in brackets: not observable; **bold**: wrong with confidence."
     yield ""
@@ -107,7 +139,7 @@ def _frames(found: Dataset) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|---|---|---|"
     for answer in found.answers:
         cells = " | ".join(_cell(answer, name) for name in AXIS_NAMES)
-        name = answer.frame if answer.frame.startswith(answer.group) else f"{answer.group} {answer.frame}"
+        name = _title(answer.group, answer.frame)
         held = ", ".join(answer.held) or "-"
         yield f"| {name} | {answer.start} | {cells} | {held} | {answer.reason} |"
 
@@ -121,30 +153,38 @@ def _cell(answer: Answer, name: AxisName) -> str:
 
 
 def _times(found: Dataset) -> Iterator[str]:
-    yield "Median wall time of an answer, ms."
+    yield "Median wall time of an answer, ms; of the coarse stage after masks, of one frame."
     yield ""
     stages = list(dict.fromkeys(stage for one in found.summaries for stage in one.ms if stage != "all"))
-    yield f"| set | {' | '.join(stages)} | all |"
-    yield "|---|" + "---|" * (len(stages) + 1)
-    for one in found.summaries:
+    yield f"| set | {' | '.join(stages)} | all | coarse |"
+    yield "|---|" + "---|" * (len(stages) + 2)
+    for one, coarse in zip(found.summaries, found.coarse_summaries, strict=True):
         cells = " | ".join(f"{one.ms[stage]:.0f}" if stage in one.ms else "-" for stage in [*stages, "all"])
-        yield f"| {one.group} | {cells} |"
+        yield f"| {one.group} | {cells} | {coarse.ms:.0f} |"
 
 
 def dataset_picture(found: Dataset) -> bytes:
     """Cumulative curves as in CRLF's Figs. 5 and 6; below, those of single observable axes."""
-    answers = found.answers
-    of = f"{len(answers)} answers"
+    answers, coarse = found.answers, [one for one in found.coarse if one.found]
+    of = f"{len(answers)} answers, {len(coarse)} coarse"
     panels = [
         _cumulative(
             f"Rotation error, CRLF (16), {of}",
             "deg",
-            ([a.start_rotation_deg for a in answers], [a.rotation_deg for a in answers]),
+            (
+                [a.start_rotation_deg for a in answers],
+                [a.rotation_deg for a in answers],
+                [one.rotation_deg for one in coarse if one.rotation_deg is not None],
+            ),
         ),
         _cumulative(
             f"Translation error, CRLF (15), {of}",
             "m",
-            ([a.start_translation_m for a in answers], [a.translation_m for a in answers]),
+            (
+                [a.start_translation_m for a in answers],
+                [a.translation_m for a in answers],
+                [one.translation_m for one in coarse if one.translation_m is not None],
+            ),
         ),
         _axes_panel(found, "Observable angles", "deg", AXIS_NAMES[:3]),
         _axes_panel(found, "Observable shifts", "m", AXIS_NAMES[3:]),

@@ -55,7 +55,7 @@ def honesty(
     errors: Sequence[Floats],
     covariances: Sequence[Floats],
     seen: Sequence[NDArray[np.bool_]],
-    reference_sigma: Floats,
+    reference_sigmas: Sequence[Floats],
 ) -> Honesty | None:
     """Compares answers with what they say of themselves.
 
@@ -63,15 +63,17 @@ def honesty(
         errors: float64 (6,) of each answer, rad and m.
         covariances: float64 (6,6) of each.
         seen: bool (6,) of each: axes that it calls observable.
-        reference_sigma: float64 (6,), how well the truth itself is known; 0 in simulation.
+        reference_sigmas: float64 (6,) of each: how well its truth is known; 0 in simulation.
 
     Returns:
         The comparison, or None where no axis of any answer is observable.
     """
     ratios = np.concatenate(
         [
-            beyond(error, np.sqrt(np.diag(covariance)), reference_sigma, mask)
-            for error, covariance, mask in zip(errors, covariances, seen, strict=True)
+            beyond(error, np.sqrt(np.diag(covariance)), sigma, mask)
+            for error, covariance, mask, sigma in zip(
+                errors, covariances, seen, reference_sigmas, strict=True
+            )
         ]
         or [np.zeros(0)]
     )
@@ -79,12 +81,12 @@ def honesty(
     if len(ratios) == 0:
         return None
     squares, freedom = [], []
-    for error, covariance, mask in zip(errors, covariances, seen, strict=True):
+    for error, covariance, mask, sigma in zip(errors, covariances, seen, reference_sigmas, strict=True):
         if mask.any():
-            squares.append(normalised_square(error, covariance + np.diag(reference_sigma**2), mask))
+            squares.append(normalised_square(error, covariance + np.diag(sigma**2), mask))
             freedom.append(int(mask.sum()))
     # Answers see different numbers of axes: through their own distribution all of them become uniform.
-    levels = stats.chi2.cdf(squares, freedom)
+    levels = np.asarray(stats.chi2.cdf(squares, freedom), dtype=np.float64)
     return Honesty(
         axes=len(ratios),
         within_one=float((ratios <= 1).mean()),

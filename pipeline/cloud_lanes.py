@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cloud_lines import cloud_line, total_least_squares
+from pipeline.cloud_lines import cloud_line, total_least_squares, unrepeated
 from pipeline.ground import Ground, plane_basis
 from pipeline.paint_marks import PaintMarks, along_tracks
 from pipeline.records import CloudLine, Floats, PointCloud
@@ -76,7 +76,7 @@ def find_lanes(cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Ge
     """
     if cloud.intensity is None:
         return []
-    index = np.flatnonzero(ground.inliers & seen)
+    index = unrepeated(cloud.xyz, np.flatnonzero(ground.inliers & seen))
     plan = np.asarray(cloud.xyz[index], dtype=np.float64) @ plane_basis(ground.normal).T
     reach = np.hypot(plan[:, 0], plan[:, 1])
     near = (reach > LANE_RANGE_M[0]) & (reach < LANE_RANGE_M[1])
@@ -95,7 +95,7 @@ def find_lanes(cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Ge
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Paint:
-    """Points of the ground in the plan, float64 (N,2), their intensity (N,) and the marks along their tracks."""
+    """Points of the ground in the plan (N,2), their intensity (N,) and the marks along their tracks."""
 
     plan: Floats
     shade: Floats

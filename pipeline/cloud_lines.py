@@ -50,3 +50,21 @@ def cloud_line(label: LineLabel, axis: FittedAxis, points: NDArray[np.int64]) ->
         float((axis.along**2).sum()),
         -low,
     )
+
+
+def unrepeated(xyz: NDArray[np.float32], index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """``index`` (M,) into points (N,3), of points that stand there twice only the first.
+
+    Both echoes of a beam may be one and the same; what is counted twice would seem known twice as well.
+    """
+    bits = np.ascontiguousarray(xyz[index]).view(np.uint32).astype(np.uint64)
+    # Points of one key are one point: 64 bits tell millions apart.
+    key = bits @ _ODD
+    in_order = np.sort(key)
+    if (in_order[1:] != in_order[:-1]).all():
+        return index
+    return np.asarray(index[np.sort(np.unique(key, return_index=True)[1])])
+
+
+_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
+"""Odd numbers without a pattern, whose multiples scatter over 64 bits."""

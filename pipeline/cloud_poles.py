@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cloud_lines import FittedAxis, cloud_line, total_least_squares
+from pipeline.cloud_lines import FittedAxis, cloud_line, total_least_squares, unrepeated
 from pipeline.ground import Ground, plane_basis
 from pipeline.records import CloudLine, Floats, PointCloud
 
@@ -75,7 +75,7 @@ def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> li
     """
     basis = plane_basis(ground.normal).astype(np.float32)
     height = cloud.xyz @ ground.normal.astype(np.float32) + np.float32(ground.offset)
-    index = np.flatnonzero(seen & (height > BOTTOM_M) & (height < CEILING_M))
+    index = unrepeated(cloud.xyz, np.flatnonzero(seen & (height > BOTTOM_M) & (height < CEILING_M)))
     plan = (cloud.xyz[index] @ basis.T).astype(np.float64)
     near = np.hypot(plan[:, 0], plan[:, 1]) < POLE_RANGE_M
     index, plan = index[near], plan[near]

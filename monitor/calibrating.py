@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -60,7 +60,8 @@ class Calibration(BaseModel):
     axes: dict[AxisName, AxisResult]
     T_cam_lidar: list[list[float]] | None
     hash: str | None
-    relative_to: Literal["stored"] = "stored"
+    relative_to: Literal["stored", "found"] = "stored"
+    """What the corrections are against: the stored extrinsic, or a first guess that was found before."""
 
 
 def calibrate(
@@ -73,6 +74,7 @@ def calibrate(
     stop: threading.Event,
     progress: Callable[[int], None] | None,
     tell: Callable[[str], None] = lambda _: None,
+    guesses: Mapping[str, Floats] | None = None,
 ) -> tuple[Calibration, ...]:
     """Estimates the extrinsic of every pair of a recording.
 
@@ -85,11 +87,15 @@ def calibrate(
         stop: Ends the reading early; what was read counts.
         progress: Told the number of pairs.
         tell: Told what of the recording was lost or dropped, one sentence each.
+        guesses: First guesses float64 (4,4) by pair, in place of the stored extrinsics, which may be absent;
+            pairs without one are left out. None: the stored ones.
 
     Raises:
         CalibwatchError: Recording, rig or model can not be used.
     """
-    rig = prepare(location, rig_file, drift).rig
+    rig = prepare(location, rig_file, drift, needs_extrinsic=guesses is None).rig
+    if guesses is not None:
+        rig = _guessed(rig, guesses)
     truth = {} if reference is None else _truth(reference, rig)
     window = dataclasses.replace(
         Parameters().window, longest_ns=_ALL_NS, spacing_ns=_SPACING_NS, least_frames=_NEVER
@@ -113,7 +119,19 @@ def calibrate(
             refuse_unusable(tuple(accounts.values()), intake, source.losses)
         for note in (*source.losses.notes, *intake.notes, *drop_notes(tuple(accounts.values()), intake)):
             tell(note)
-    return tuple(_result(name, watch, truth.get(name), parameters) for name, watch in watches.items())
+    results = (_result(name, watch, truth.get(name), parameters) for name, watch in watches.items())
+    relative_to = "stored" if guesses is None else "found"
+    return tuple(result.model_copy(update={"relative_to": relative_to}) for result in results)
+
+
+def _guessed(rig: Rig, guesses: Mapping[str, Floats]) -> Rig:
+    """The pairs of which there is a guess, with it in place of what is stored."""
+    pairs = tuple(
+        dataclasses.replace(pair, T_cam_lidar=guesses[pair.name], store=None)
+        for pair in rig.pairs
+        if pair.name in guesses
+    )
+    return dataclasses.replace(rig, pairs=pairs)
 
 
 def _truth(reference: Path, rig: Rig) -> dict[str, Floats]:

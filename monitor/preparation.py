@@ -35,13 +35,16 @@ class Prepared:
     notes: tuple[str, ...]
 
 
-def prepare(location: str, rig_file: Path | None, drift: Floats | None) -> Prepared:
+def prepare(
+    location: str, rig_file: Path | None, drift: Floats | None, *, needs_extrinsic: bool = True
+) -> Prepared:
     """The rig for a recording: from ``rig_file``, else from the recording itself.
 
     Args:
         location: The recording.
         rig_file: A rig file or ``calib.json``, or None.
         drift: float64 (6,), altered into every stored extrinsic (``--inject``), or None.
+        needs_extrinsic: False leaves it open where neither rig nor recording tells it.
 
     Raises:
         InputError: The recording can not be read or does not hold what the rig names.
@@ -62,7 +65,7 @@ def prepare(location: str, rig_file: Path | None, drift: Floats | None) -> Prepa
         else:
             return Prepared(*_with_drift(*_discovered(source, topics, location), drift))
     _check_types(rig, topics, location)
-    rig = completed(rig, lambda: _survey(location, topics))
+    rig = completed(rig, lambda: _survey(location, topics), needs_extrinsic=needs_extrinsic)
     return Prepared(*_with_drift(rig, notes, drift))
 
 
@@ -136,21 +139,23 @@ def _survey(location: str, topics: Sequence[TopicInfo]) -> Survey:
         return survey_in(source, topics)
 
 
-def completed(rig: Rig, survey: Callable[[], Survey]) -> Rig:
+def completed(rig: Rig, survey: Callable[[], Survey], *, needs_extrinsic: bool = True) -> Rig:
     """The rig with intrinsics and extrinsics that its file leaves open, taken from the messages.
 
     Args:
         rig: Topics are named.
         survey: Reads the beginning of the messages; called only if something is open.
+        needs_extrinsic: Whether an extrinsic that nothing tells is an error.
     """
     if all(pair.camera.model is not None and pair.T_cam_lidar is not None for pair in rig.pairs):
         return rig
     seen = survey()
-    return dataclasses.replace(rig, pairs=tuple(_completed(pair, seen) for pair in rig.pairs))
+    pairs = tuple(_completed(pair, seen, needs_extrinsic=needs_extrinsic) for pair in rig.pairs)
+    return dataclasses.replace(rig, pairs=pairs)
 
 
-def _completed(pair: RigPair, survey: Survey) -> RigPair:
-    if pair.store is not None:
+def _completed(pair: RigPair, survey: Survey, *, needs_extrinsic: bool) -> RigPair:
+    if pair.store is not None and needs_extrinsic:
         raise RigError(
             f"pair {pair.name} wants extrinsic 'store:{pair.store}', but there is no extrinsic store here",
             hint="give T_cam_lidar in the rig file, or import one with calibwatch extrinsic import",
@@ -174,11 +179,11 @@ def _completed(pair: RigPair, survey: Survey) -> RigPair:
     if T is None:
         target = camera.frame or (survey.images[image][0] if image in survey.images else "")
         chain = path(survey.transforms.values(), target, source)
-        if chain is None:
+        if chain is None and needs_extrinsic:
             raise RigError(
                 f"pair {pair.name}: no extrinsic, and no chain of transforms from {source or '(no frame)'} "
                 f"to {target or '(no frame)'}",
-                hint="give T_cam_lidar in the rig file, or record tf_static",
+                hint="give T_cam_lidar in the rig file, record tf_static, or calibrate --no-prior",
             )
-        T = compose(chain)
+        T = None if chain is None else compose(chain)
     return dataclasses.replace(pair, camera=camera, T_cam_lidar=T, T_vehicle_lidar=T_vehicle_lidar)

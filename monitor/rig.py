@@ -175,7 +175,7 @@ def parse_rig(document: Mapping[str, object], *, where: str) -> Rig:
     Raises:
         RigError: Names the key, and the nearest valid one where it is unknown.
     """
-    if "pairs" not in document and "T_cam_lidar" in document:
+    if "pairs" not in document and ("T_cam_lidar" in document or "camera" in document):
         document = calib_document(document, where=where)
     parsed = validated(document, where=where)
     names = [pair.name for pair in parsed.pairs]
@@ -200,6 +200,8 @@ def calib_document(
 ) -> dict[str, object]:
     """``calib.json`` (``camera``, ``T_cam_lidar``; other keys are notes) in the form of the rig file.
 
+    ``T_cam_lidar`` may be absent where it is to be found out.
+
     Args:
         calib: What ``calib.json`` holds.
         where: Name of the file, for messages.
@@ -210,8 +212,11 @@ def calib_document(
         spin: Sense of rotation of the LiDAR where the kind of folder tells it.
     """
     lens = calib.get("camera")
-    if not isinstance(lens, Mapping) or "T_cam_lidar" not in calib:
-        raise RigError(f"{where} has no 'camera' and 'T_cam_lidar'", hint="calib.json needs both")
+    if not isinstance(lens, Mapping):
+        raise RigError(
+            f"{where} has no 'camera' and 'T_cam_lidar'",
+            hint="calib.json needs both, but for calibrate --no-prior",
+        )
     section = {key: lens[key] for key in ("width", "height", "K") if key in lens}
     coefficients = lens.get("D") or []
     model = lens.get("distortion_model") or "none"
@@ -221,9 +226,10 @@ def calib_document(
         "name": name or own_name,
         "lidar": {"topic": lidar, "spin": spin},
         "camera": {**section, "topic": camera},
-        "extrinsic": {"T_cam_lidar": calib["T_cam_lidar"]},
         "pairing": pairing,
     }
+    if "T_cam_lidar" in calib:
+        pair["extrinsic"] = {"T_cam_lidar": calib["T_cam_lidar"]}
     if "T_vehicle_lidar" in calib:
         pair["T_vehicle_lidar"] = calib["T_vehicle_lidar"]
     return {"pairs": [pair]}

@@ -15,6 +15,7 @@ from pipeline.cloud_lines import cloud_line, total_least_squares, unrepeated
 from pipeline.ground import Ground, plane_basis
 from pipeline.paint_marks import PaintMarks, along_tracks
 from pipeline.records import CloudLine, Floats, PointCloud
+from pipeline.rings import has_rings
 
 Bools: TypeAlias = NDArray[np.bool_]
 Indices: TypeAlias = NDArray[np.int64]
@@ -83,7 +84,7 @@ def find_lanes(cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Ge
     index, plan, reach = index[near], plan[near], reach[near]
     shade = np.asarray(cloud.intensity[index], dtype=np.float64)
     ring = None
-    if cloud.ring is not None and int(cloud.ring.max(initial=0)) > 0:
+    if cloud.ring is not None and has_rings(cloud):
         ring = cloud.ring[index].astype(np.int64)
     paint = _Paint(plan, shade, along_tracks(plan, shade, ring, ground.offset))
     lines = []

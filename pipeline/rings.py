@@ -89,13 +89,18 @@ class ScanPattern:
     ring_spacing: float
 
 
+def has_rings(cloud: PointCloud) -> bool:
+    """Whether the ring field tells rings apart; one number for all points is a converter's filler."""
+    return cloud.ring is not None and len(cloud) > 0 and int(cloud.ring.min()) < int(cloud.ring.max())
+
+
 def spin_turns(cloud: PointCloud) -> tuple[Floats, ...]:
     """Rotations (3,3) that may bring the spin axis of the sensor to z, the likeliest first.
 
     Messages name their axes as they like. Where rings are numbered, the spin axis is the one about which a
     ring keeps its elevation; else z is tried before the others.
     """
-    if cloud.ring is None or len(cloud) == 0 or int(cloud.ring.max()) == 0:
+    if cloud.ring is None or not has_rings(cloud):
         return _TURNS
     few = slice(None, None, max(1, len(cloud) // _AXIS_POINTS))
     xyz, ring = cloud.xyz[few].astype(np.float64), cloud.ring[few].astype(np.int64)
@@ -152,7 +157,7 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
 
 def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
     """A ring number for each point (-1: none), from the cloud's own field, its order or its elevations."""
-    if cloud.ring is not None and len(cloud) and int(cloud.ring.max()) > 0:
+    if cloud.ring is not None and has_rings(cloud):
         return cloud.ring.astype(np.int64)
     if len(cloud) < _FEWEST_RINGS:
         return None

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.cloud_lines import unrepeated
 from pipeline.jump_lines import jump_lines
 from pipeline.plane_edges import borders, creases
 from pipeline.planes import DEFAULT_SPACING_RAD, find_planes, thinned
@@ -60,11 +61,9 @@ def find_structure_lines(
         found = find_structure_lines(PointCloud(cloud.xyz[index], None, ring), seen[index], rng, origin)
         return [dataclasses.replace(line, points=index[line.points]) for line in found]
     xyz = cloud.xyz.astype(np.float64) - shift
-    keep = seen
-    if keep.sum() > MOST_POINTS:
-        chosen = np.flatnonzero(keep)
-        keep = np.zeros(len(keep), dtype=bool)
-        keep[chosen[:: math.ceil(len(chosen) / MOST_POINTS)]] = True
+    chosen = unrepeated(cloud.xyz, np.flatnonzero(seen))
+    keep = np.zeros(len(xyz), dtype=bool)
+    keep[chosen[:: max(1, math.ceil(len(chosen) / MOST_POINTS))]] = True
     turn, pattern = _pattern(cloud, xyz, keep)
     spacing = DEFAULT_SPACING_RAD if pattern is None else max(pattern.ring_spacing, pattern.azimuth_step)
     cells = thinned(xyz, keep, spacing)

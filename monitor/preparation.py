@@ -178,7 +178,8 @@ def _completed(pair: RigPair, survey: Survey, *, needs_extrinsic: bool) -> RigPa
         T_vehicle_lidar = next((compose(chain) for chain in chains if chain is not None), None)
     if T is None:
         target = camera.frame or (survey.images[image][0] if image in survey.images else "")
-        chain = path(survey.transforms.values(), target, source)
+        # Frames without names are not one and the same.
+        chain = path(survey.transforms.values(), target, source) if source and target else None
         if chain is None and needs_extrinsic:
             raise RigError(
                 f"pair {pair.name}: no extrinsic, and no chain of transforms from {source or '(no frame)'} "

@@ -137,11 +137,13 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
     rank = _rank_by_elevation(ring[chosen], elevation)
     order = np.argsort(azimuth, kind="stable")
     order = order[grouped(rank[order])]
+    spacing = np.diff(group_medians(elevation[order], rank[order], int(rank.max()) + 1))
+    # Where both echoes of a beam are one and the same, the second is no neighbour of the first.
+    again = (np.diff(rank[order]) == 0) & (np.diff(xyz[order], axis=0) == 0.0).all(axis=1)
+    order = order[np.concatenate([[True], ~again])]
     rank, azimuth = rank[order], azimuth[order]
     step = np.diff(azimuth)[np.diff(rank) == 0]
     step = step[step > _LEAST_STEP_RAD]
-    medians = group_medians(elevation[order], rank, int(rank[-1]) + 1)
-    spacing = np.diff(medians)
     if step.size == 0 or spacing.size == 0:
         return None
     return ScanPattern(

@@ -13,7 +13,7 @@ from monitor.messages import Message
 from monitor.preparation import prepare
 from monitor.rig import Rig, parse_rig
 from monitor.sources import kinds, open_source
-from pipeline.errors import InputError
+from pipeline.errors import CalibwatchError, InputError
 from pipeline.records import CameraModel, Floats, FramePair
 from pipeline.se3 import stored_before
 from pipeline.simulation.drive import Drive
@@ -196,9 +196,8 @@ def _is_recording(path: Path) -> bool:
 
 
 def _listed(location: Path, group: str, most: int, tell: Callable[[str], None]) -> _Recording:
-    rig = prepare(str(location), None, None).rig
-    counts = dict.fromkeys((pair.name for pair in rig.pairs), 0)
-    cameras = {pair.name: mount_of(pair).camera for pair in rig.pairs}
+    rig, cameras = _stated(location)
+    counts = dict.fromkeys(cameras, 0)
     intake = Intake(rig)
     with open_source(str(location)) as source:
         for pair in _pairs(source, intake):
@@ -219,6 +218,17 @@ def _listed(location: Path, group: str, most: int, tell: Callable[[str], None]) 
         tell(f"{location}: {note}")
     chosen = frozenset((name, k) for name, count in counts.items() for k in _spread(count, most))
     return _Recording(location, group, rig, chosen, several=max(counts.values()) > 1)
+
+
+def _stated(location: Path) -> tuple[Rig, dict[str, CameraModel]]:
+    """The rig that a recording states, and the cameras of its pairs; what is refused names the recording."""
+    try:
+        rig = prepare(str(location), None, None).rig
+        return rig, {pair.name: mount_of(pair).camera for pair in rig.pairs}
+    except CalibwatchError as error:
+        if str(location) in error.what:
+            raise
+        raise type(error)(f"{location}: {error.what}", hint=error.hint) from error
 
 
 def _spread(count: int, most: int) -> list[int]:

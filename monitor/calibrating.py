@@ -1,13 +1,13 @@
 """The extrinsic of a recording or a single frame against a first guess, and how good it is."""
 
 import dataclasses
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from monitor.daemon import extrinsic_hash, mount_of
@@ -21,17 +21,16 @@ from monitor.sources import Source, open_source
 from monitor.statements import TO_PEOPLE
 from monitor.status import AXIS_NAMES, AxisName, unit_of
 from pipeline import se3
+from pipeline.calibration import Calibrated, CalibrationParameters, Calibrator
 from pipeline.errors import RigError
+from pipeline.frame_modes import Prior
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, FramePair
 from pipeline.segmentation import Segmenter
-from pipeline.watch import Findings, Mount, Watch
+from pipeline.watch import DropReason, Mount
 
-_ALL_NS = 1 << 62
-"""ns; a calibration looks at the whole recording."""
-
-_SPACING_NS = 500_000_000
-"""ns between frames of a long recording: other things are in view."""
+_FOUND = Prior(sigma_rad=math.radians(1.5), sigma_m=0.25)
+"""How far off a first guess is that was found with no stored extrinsic: 95 of 100 within 3 deg, 0.5 m."""
 
 
 class AxisResult(BaseModel):
@@ -40,9 +39,9 @@ class AxisResult(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     value: FiniteFloat
-    """Correction: motion of the mount from the first guess to the estimate."""
+    """Correction: motion of the mount from the first guess to the estimate; held directions stay."""
     sigma: FiniteFloat
-    """Random error of these frames and the floor between scenes, together."""
+    """Random error of these frames, rival fits and the floor between scenes, together."""
     observable: bool
     error: FiniteFloat | None = None
     """Estimate against the reference, where one was given."""
@@ -56,6 +55,8 @@ class Calibration(BaseModel):
     pair: str
     frames: int
     observable: tuple[str, ...]
+    held: tuple[str, ...]
+    """Directions that are not known, the weakest first, named after the axes that they lean on."""
     reason: str
     axes: dict[AxisName, AxisResult]
     T_cam_lidar: list[list[float]] | None
@@ -97,21 +98,20 @@ def calibrate(
     if guesses is not None:
         rig = _guessed(rig, guesses)
     truth = {} if reference is None else _truth(reference, rig)
-    window = dataclasses.replace(
-        Parameters().window, longest_ns=_ALL_NS, spacing_ns=_SPACING_NS, least_frames=_NEVER
-    )
-    parameters = dataclasses.replace(Parameters(), window=window)
+    settings = CalibrationParameters(prior=Prior() if guesses is None else _FOUND)
     segmenter = Segmenter(model_bytes(model))
-    watches = {pair.name: Watch(mount_of(pair), parameters, segmenter) for pair in rig.pairs}
+    calibrators = {
+        pair.name: Calibrator(mount_of(pair), Parameters(), segmenter, settings) for pair in rig.pairs
+    }
     intake = Intake(rig)
     accounts = {
-        name: Account(name, 0, Counter(), watch.mount.camera, None) for name, watch in watches.items()
+        name: Account(name, 0, Counter(), one.mount.camera, None) for name, one in calibrators.items()
     }
     count = 0
     with open_source(location) as source:
         for pair in _pairs(source, intake, stop):
-            findings = watches[pair.pair].step(pair)
-            accounts[pair.pair] = _counted(accounts[pair.pair], pair, findings)
+            dropped = calibrators[pair.pair].step(pair)
+            accounts[pair.pair] = _counted(accounts[pair.pair], pair, dropped)
             count += 1
             if progress is not None:
                 progress(count)
@@ -119,7 +119,7 @@ def calibrate(
             refuse_unusable(tuple(accounts.values()), intake, source.losses)
         for note in (*source.losses.notes, *intake.notes, *drop_notes(tuple(accounts.values()), intake)):
             tell(note)
-    results = (_result(name, watch, truth.get(name), parameters) for name, watch in watches.items())
+    results = (_result(name, one.mount, one.finish(), truth.get(name)) for name, one in calibrators.items())
     relative_to = "stored" if guesses is None else "found"
     return tuple(result.model_copy(update={"relative_to": relative_to}) for result in results)
 
@@ -158,53 +158,36 @@ def _pairs(source: Source, intake: Intake, stop: threading.Event) -> Iterator[Fr
     yield from intake.flush()
 
 
-def _counted(account: Account, pair: FramePair, findings: Findings) -> Account:
-    if findings.dropped is None:
+def _counted(account: Account, pair: FramePair, reason: DropReason | None) -> Account:
+    if reason is None:
         return dataclasses.replace(account, used=account.used + 2)
-    wrong_size = pair.image.size if findings.dropped == "image_size" else account.wrong_size
-    dropped = account.dropped + Counter({findings.dropped: 2})
+    wrong_size = pair.image.size if reason == "image_size" else account.wrong_size
+    dropped = account.dropped + Counter({reason: 2})
     return dataclasses.replace(account, dropped=dropped, wrong_size=wrong_size)
 
 
-_NEVER = 1 << 30
-"""Frames before a judgement in between: a calibration judges once, at the end."""
-
-
-def _result(name: str, watch: Watch, truth: Floats | None, parameters: Parameters) -> Calibration:
-    watch.finish()
-    belief, mount = watch.belief, watch.mount
-    if belief is None:
-        return Calibration(
-            pair=name,
-            frames=watch.frames,
-            observable=(),
-            reason="no edges and no lines were found that image and cloud have in common",
-            axes={},
-            T_cam_lidar=None,
-            hash=None,
-        )
-    judgement = belief.judgement
-    total = np.sqrt(judgement.sigma**2 + np.diag(parameters.test.floor()))
-    observable = (total <= parameters.test.most_sigma * mount.limits) & ~np.array(judgement.blind)
-    errors = None if truth is None else _errors(mount, truth, belief.T_estimated)
-    axes = {
+def _result(name: str, mount: Mount, found: Calibrated, truth: Floats | None) -> Calibration:
+    errors = None if truth is None else _errors(mount, truth, found.T_estimated)
+    axes: dict[AxisName, AxisResult] = {
         axis: AxisResult(
-            value=float(judgement.drift[i] * TO_PEOPLE[i]),
-            sigma=float(total[i] * TO_PEOPLE[i]),
-            observable=bool(observable[i]),
+            value=float(found.drift[i] * TO_PEOPLE[i]),
+            sigma=float(found.sigma[i] * TO_PEOPLE[i]),
+            observable=bool(found.observable[i]),
             error=None if errors is None else float(errors[i] * TO_PEOPLE[i]),
         )
         for i, axis in enumerate(AXIS_NAMES)
     }
-    seen = tuple(axis for axis, result in axes.items() if result.observable)
+    # Without a single fit there is no answer, not even a bad one.
+    answered = bool(found.modes)
     return Calibration(
         pair=name,
-        frames=watch.frames,
-        observable=seen,
-        reason=_reason(axes, blind=judgement.blind, contradicted=judgement.contradicted),
-        axes=axes,
-        T_cam_lidar=belief.T_estimated.tolist(),
-        hash=extrinsic_hash(belief.T_estimated),
+        frames=found.frames,
+        observable=tuple(axis for axis, result in axes.items() if result.observable),
+        held=found.held,
+        reason=_reason(found, axes),
+        axes=axes if answered else {},
+        T_cam_lidar=found.T_estimated.tolist() if answered else None,
+        hash=extrinsic_hash(found.T_estimated) if answered else None,
     )
 
 
@@ -214,15 +197,12 @@ def _errors(mount: Mount, truth: Floats, estimate: Floats) -> Floats:
     return se3.mount_drift(truth, estimate, R_vehicle_cam)
 
 
-def _reason(axes: dict[AxisName, AxisResult], *, blind: bool, contradicted: bool) -> str:
-    """Why something is not observable, or that all is; one clause."""
-    if blind:
-        return "image and cloud show nothing in common (dark, blocked, no edges, or a first guess far off)"
-    if contradicted:
-        return "lines and edges contradict each other beyond their errors; the edges' answer is given"
+def _reason(found: Calibrated, axes: dict[AxisName, AxisResult]) -> str:
+    """What the calibration says of itself, and how well the axes are known that are not observable."""
     weak = [
         f"{axis} is known to {result.sigma:.2g} {unit_of(axis)} only"
-        for axis, result in ((axis, axes[axis]) for axis in AXIS_NAMES)
+        for axis, result in axes.items()
         if not result.observable
     ]
-    return ", ".join(weak) if weak else "all six axes are observable"
+    # Where nothing is observable the reason says it all.
+    return "; ".join([found.reason, *weak]) if found.observable.any() else found.reason

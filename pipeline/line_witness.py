@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from pipeline import line_doubt, plk, se3
 from pipeline.association import NO_PAIRS, Association, associate
-from pipeline.cameras import undistort
+from pipeline.cameras import limit_of, undistort
 from pipeline.cloud_lanes import find_lanes
 from pipeline.cloud_poles import find_poles
 from pipeline.ground import Ground, fit_ground
@@ -148,16 +148,22 @@ def in_view(cloud: PointCloud, camera: CameraModel, T_cam_lidar: Floats) -> NDAr
         + [np.column_stack([np.full(9, e), v]) for e in (0, camera.width - 1)]
     ).astype(np.float64)
     rays = undistort(camera, border)
-    rays = rays[np.isfinite(rays).all(axis=1)]
-    if len(rays) == 0:
-        return np.ones(len(cloud), dtype=bool)
-    low, high = rays.min(axis=0), rays.max(axis=0)
+    if np.isfinite(rays).all():
+        low, high = rays.min(axis=0), rays.max(axis=0)
+    else:
+        # The lens ends inside the image: as far as it goes, it sees.
+        high = np.full(2, min(limit_of(camera), _WIDEST_SLOPE))
+        low = -high
     margin = VIEW_MARGIN * (high - low)
     low, high = (low - margin).astype(np.float32), (high + margin).astype(np.float32)
     T = T_cam_lidar.astype(np.float32)
     x, y, z = (T[:3, :3] @ cloud.xyz.T) + T[:3, 3:]
     inside = (z > MIN_DEPTH_M) & (x > low[0] * z) & (x < high[0] * z) & (y > low[1] * z) & (y < high[1] * z)
     return np.asarray(inside)
+
+
+_WIDEST_SLOPE = 1e4
+"""Of a lens that sees 180 deg and more."""
 
 
 def solve_lines(

@@ -74,7 +74,7 @@ def test_an_upright_pole_gives_the_truth_to_rounding():
     truth = scenes.truth_of(rng)
     cloud, image = scenes.lines_of(rng, truth, *scenes.road(rng, lanes=2, poles=0), **EXACT)
     foot = np.array([12.0, 3.5, -scenes.HEIGHT])
-    ends = se3.apply(truth, np.stack([foot, foot + [0.0, 0.0, 2.0]]))
+    ends = se3.apply(truth, np.stack([foot, [*foot[:2], foot[2] + 2.0]]))
     uv = (ends @ scenes.CAMERA.K.T)[:, :2] / ends[:, 2:]
     pole = dataclasses.replace(image[0], label="pole", start=uv[0], end=uv[1])
     T = lane_pair_extrinsics(cloud, [*image, pole], level(np.eye(3)), scenes.CAMERA)

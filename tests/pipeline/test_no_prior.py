@@ -40,7 +40,7 @@ def camera(drive):
 
 
 def find(frame, camera, *, R=None, seed=1, **given):
-    """The outcome of a frame whose LiDAR is turned by R, and its turn in deg and shift in m from the truth."""
+    """The outcome of a frame whose LiDAR is turned by R, and the true extrinsic then."""
     R = np.eye(3) if R is None else R
     cloud = dataclasses.replace(frame.cloud, xyz=(frame.cloud.xyz @ R.T).astype(np.float32))
     cloud, image, masks = (
@@ -115,7 +115,7 @@ def test_a_wide_prior_needs_no_lines(street, camera):
     assert shifted < 0.25
 
 
-def test_a_picture_of_another_street_is_not_calibrated(drive, street, camera):
+def test_a_picture_of_another_street_is_not_calibrated(street, camera):
     """Lines of one place, edges of another: nothing is claimed."""
     shifted = CameraImage(np.ascontiguousarray(street.image.pixels[:, ::-1]))
     lane, pole = (

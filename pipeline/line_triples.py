@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import p3l
+from pipeline.association import OUTERMOST
 from pipeline.errors import InputError
 from pipeline.records import CameraModel, CloudLine, Floats, ImageLine, LineLabel
 
@@ -127,8 +128,8 @@ def _length(line: CloudLine | ImageLine) -> float:
 
 
 def is_usable(line: CloudLine | ImageLine) -> bool:
-    """Whether a line has finite ends that differ."""
-    return bool(np.isfinite(line.start).all() and np.isfinite(line.end).all() and _length(line) > 0.0)
+    """Whether a line has ends within reach that differ."""
+    return all((np.abs(end) < OUTERMOST).all() for end in (line.start, line.end)) and _length(line) > 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

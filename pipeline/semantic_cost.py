@@ -273,6 +273,14 @@ class EvolutionParameters:
     least: float = 0.002
     reach: float = 4.0
 
+    def __post_init__(self) -> None:
+        if self.population < _FEWEST:
+            raise InputError(f"evolution: population {self.population} is below {_FEWEST}")
+
+
+_FEWEST = 4
+"""Extrinsics a generation: two parents, without which there is no covariance to learn."""
+
 
 def evolution_search(
     T_start: Floats,

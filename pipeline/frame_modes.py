@@ -49,7 +49,8 @@ class ModeParameters:
     Attributes:
         reach: Sigmas of the prior that are searched: 95 % of each axis.
         farthest: Sigmas of the prior; a maximum further off is not believed.
-        draws: Places at which the coarsest level is looked at; a power of two.
+        usual_m: Distance of what most edges show, m: a shift looks like the turn by the same bearing there.
+        draws: Turns at which the coarsest level is looked at; a power of two.
         climbed: The best of them that are climbed from.
         spread: Alert units between places that are climbed from: the coarsest level's blur.
         hops_rad: Turns from the best maximum along its valleys, rad.
@@ -64,6 +65,7 @@ class ModeParameters:
 
     reach: float = 2.0
     farthest: float = 4.0
+    usual_m: float = 15.0
     draws: int = 256
     climbed: int = 10
     spread: float = 4.0
@@ -170,9 +172,15 @@ def _refined(batch: EdgeBatch, T_guess: Floats, tops: Sequence[Top], parameters:
 def _promising(
     thin: EdgeBatch, T_guess: Floats, prior: Prior, parameters: ModeParameters, rng: np.random.Generator
 ) -> list[Floats]:
-    """The best of evenly drawn places at the coarsest level, apart from each other."""
-    drawn = qmc.Sobol(6, rng=rng).random(parameters.draws)
-    places = (2.0 * drawn - 1.0) * parameters.reach * prior.sigma
+    """The best of evenly drawn turns at the coarsest level, apart from each other.
+
+    Only turns are drawn: what is seen of a shift at the usual distance is the turn by the same bearing, and
+    three axes are filled more densely than six.
+    """
+    drawn = qmc.Sobol(3, rng=rng).random(parameters.draws)
+    widest = parameters.reach * math.hypot(prior.sigma_rad, prior.sigma_m / parameters.usual_m)
+    places = np.zeros((parameters.draws, 6))
+    places[:, :3] = (2.0 * drawn - 1.0) * widest
     level = len(thin.stacks) - 1
     heights = [edge_witness.score_only(thin, se3.retract(T_guess, xi), level).sum() for xi in places]
     picked: list[Floats] = []

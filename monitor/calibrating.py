@@ -29,7 +29,7 @@ from pipeline.records import Floats, FramePair
 from pipeline.segmentation import Segmenter
 from pipeline.watch import DropReason, Mount
 
-_FOUND = Prior(sigma_rad=math.radians(1.5), sigma_m=0.25)
+FOUND = Prior(sigma_rad=math.radians(1.5), sigma_m=0.25)
 """How far off a first guess is that was found with no stored extrinsic: 95 of 100 within 3 deg, 0.5 m."""
 
 
@@ -98,7 +98,7 @@ def calibrate(
     if guesses is not None:
         rig = _guessed(rig, guesses)
     truth = {} if reference is None else _truth(reference, rig)
-    settings = CalibrationParameters(prior=Prior() if guesses is None else _FOUND)
+    settings = CalibrationParameters(prior=Prior() if guesses is None else FOUND)
     segmenter = Segmenter(model_bytes(model))
     calibrators = {
         pair.name: Calibrator(mount_of(pair), Parameters(), segmenter, settings) for pair in rig.pairs

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from monitor.clock import Clock
 from monitor.evaluated_frames import EvaluatedFrame, EvaluatedFrames
+from monitor.first_guess import PriorSigma, masks_of_network
 from monitor.frame_calibration import Stopwatch, calibrated
 from pipeline import basin, se3
 from pipeline.association import associate
@@ -19,9 +20,9 @@ from pipeline.cloud_poles import find_poles
 from pipeline.ground import fit_ground
 from pipeline.height_maps import height_maps
 from pipeline.line_witness import find_lines
-from pipeline.masks import MaskParameters, horizon_line, masks_from_probabilities
+from pipeline.masks import horizon_line
 from pipeline.records import CloudLine, Floats
-from pipeline.segmentation import Segmenter, grid_scale
+from pipeline.segmentation import Segmenter
 from pipeline.semantic_cost import points_of_lines
 
 Progress = Callable[[str, int, int], None]
@@ -123,13 +124,7 @@ def scene_of(frame: EvaluatedFrame, segmenter: Segmenter, rng: np.random.Generat
     """Lines, points and masks of a frame, found under its true extrinsic."""
     mount, pair, camera = frame.mount, frame.pair, frame.camera
     up_cam = mount.T_cam_lidar[:3, :3] @ mount.up
-    masks = masks_from_probabilities(
-        segmenter.probabilities(pair.image.pixels),
-        pair.image.pixels,
-        MaskParameters(),
-        horizon_line(camera, up_cam),
-        grid_scale(*pair.image.size),
-    )
+    masks = masks_of_network(segmenter, pair, horizon_line(camera, up_cam))
     ground = fit_ground(pair.cloud, mount.up, rng)
     lines = find_lines(
         pair.cloud,
@@ -170,10 +165,23 @@ def _errors(
     """CRLF (15), m, and (16), rad, of every way from one start; None without an answer."""
     mount = frame.off_by(drift)
     extrinsics: dict[Way, Floats | None] = dict(basin.answers(scene, mount.T_cam_lidar, rng).items())
-    whole = calibrated(frame, mount, segmenter, Stopwatch(clock))
+    whole = calibrated(frame, mount, segmenter, Stopwatch(clock), _told(drift))
     extrinsics["calibrate"] = whole.T_estimated if whole.observable.any() else None
     truth = frame.mount.T_cam_lidar
     return {way: None if T is None else se3.pose_error(truth, T) for way, T in extrinsics.items()}
+
+
+_GUESS = np.array([math.radians(2.0)] * 3 + [0.3] * 3)
+"""rad and m; what ``calibwatch calibrate`` takes a first guess to be right to unless told otherwise."""
+
+
+def _told(drift: Floats) -> PriorSigma | None:
+    """What somebody would say of a start who knows about how far off it is; nothing of a near one."""
+    widest = np.maximum(np.abs(drift), _GUESS)
+    if (widest <= _GUESS).all():
+        return None
+    # Two sigmas are what is searched.
+    return PriorSigma(float(widest[:3].max()) / 2.0, float(widest[3:].max()) / 2.0)
 
 
 def _curve(sweep: Sweep, runs: int, found: dict[_Key, list[tuple[float, float] | None]]) -> Curve:

@@ -33,6 +33,7 @@ def basin_text(found: Basin) -> str:
         f"{found.frames} frames, {found.starts} starts each at every initial error (seed {found.seed}).",
         "Success, then medians of the answers: (16) of CRLF in deg / (15) in m.",
         f"Methods I, II and I from II know their matches: {_matches(found)}.",
+        "Calibrate is told how far off the start may be (--prior-sigma) where that is more than its default.",
     ]
     for sweep, curve in found.sweeps.items():
         lines += ["", f"{_TITLES[sweep]}. Success: within {_wanted(sweep)}.", ""]

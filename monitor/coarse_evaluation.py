@@ -7,13 +7,13 @@ from pydantic import BaseModel, ConfigDict
 
 from monitor.clock import Clock
 from monitor.evaluated_frames import EvaluatedFrame
+from monitor.first_guess import masks_of_network
 from monitor.frame_calibration import Stopwatch, errors_of
 from monitor.statements import TO_PEOPLE
 from pipeline import se3
 from pipeline.error_statistics import mean_absolute
-from pipeline.masks import MaskParameters, masks_from_probabilities
 from pipeline.no_prior import FoundExtrinsic, find_extrinsic
-from pipeline.segmentation import Segmenter, grid_scale
+from pipeline.segmentation import Segmenter
 
 NEAR_DEG, NEAR_M = 3.0, 0.5
 """deg and m; CRLF's largest errors of the coarse stage: what a refinement is asked to start from."""
@@ -70,13 +70,9 @@ class CoarseSummary(_Values):
 def coarse_of(frame: EvaluatedFrame, segmenter: Segmenter, seed: int, clock: Clock) -> Coarse:
     """Looks for the extrinsic of a frame without a first guess."""
     times, pair = Stopwatch(clock), frame.pair
-    with times.stage("network"):
-        probabilities = segmenter.probabilities(pair.image.pixels)
     with times.stage("masks"):
         # Without an extrinsic nobody knows where the horizon is.
-        masks = masks_from_probabilities(
-            probabilities, pair.image.pixels, MaskParameters(), None, grid_scale(*pair.image.size)
-        )
+        masks = masks_of_network(segmenter, pair, None)
     with times.stage("coarse"):
         found = find_extrinsic(pair.cloud, pair.image, masks, frame.camera, np.random.default_rng(seed))
     known = Coarse(

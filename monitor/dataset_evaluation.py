@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from monitor.clock import Clock
 from monitor.coarse_evaluation import Coarse, CoarseSummary, coarse_of, coarse_summary
 from monitor.evaluated_frames import EvaluatedFrame, EvaluatedFrames
+from monitor.first_guess import PriorSigma
 from monitor.frame_calibration import Stopwatch, calibrated, drawn_start, errors_of
 from monitor.statements import TO_PEOPLE
 from monitor.status import AXIS_NAMES, AxisName
@@ -35,12 +36,14 @@ class Options:
         rotation_deg: Starts are off by up to so much about each axis, deg.
         translation_m: Likewise along each axis, m.
         seed: Of the starts.
+        prior_sigma: As calibrate takes it with ``--prior-sigma``, or None: starts are first guesses.
     """
 
     starts: int = STARTS
     rotation_deg: float = ROTATION_DEG
     translation_m: float = TRANSLATION_M
     seed: int = SEED
+    prior_sigma: PriorSigma | None = None
 
     @property
     def widest(self) -> Floats:
@@ -129,6 +132,8 @@ class Dataset(_Values):
     rotation_deg: float
     translation_m: float
     seed: int
+    prior_sigma: tuple[float, float] | None
+    """Deg and m, as calibrate was told; null: it was not."""
     summaries: tuple[Summary, ...]
     coarse_summaries: tuple[CoarseSummary, ...]
     answers: tuple[Answer, ...]
@@ -174,6 +179,9 @@ def evaluate(
         rotation_deg=options.rotation_deg,
         translation_m=options.translation_m,
         seed=options.seed,
+        prior_sigma=None
+        if options.prior_sigma is None
+        else (float(np.degrees(options.prior_sigma.sigma_rad)), options.prior_sigma.sigma_m),
         summaries=tuple(
             _summary(name, [run for run in runs if run.answer.group in those]) for name, those in sets.items()
         ),
@@ -190,7 +198,7 @@ def _run(frame: EvaluatedFrame, start: int, segmenter: Segmenter, options: Optio
     mount = frame.off_by(drawn_start(frame, start, options.widest, options.seed))
     times = Stopwatch(clock)
     with times.stage("all"):
-        found = calibrated(frame, mount, segmenter, times)
+        found = calibrated(frame, mount, segmenter, times, options.prior_sigma)
     off, error = errors_of(frame, mount.T_cam_lidar), errors_of(frame, found.T_estimated)
     answer = _answer(frame, start, found, (mount.T_cam_lidar, off, error)).model_copy(
         update={"ms": dict(times.ms)}

@@ -37,9 +37,13 @@ def dataset_text(found: Dataset) -> str:
 
 
 def _head(found: Dataset) -> Iterator[str]:
+    told = ""
+    if found.prior_sigma is not None:
+        deg, m = found.prior_sigma
+        told = f"; calibrate was told that they are off by {deg:g} deg and {m:g} m (one sigma)"
     yield (
         f"{found.starts} starts a frame (seed {found.seed}), uniform within {found.rotation_deg:g} deg and "
-        f"{found.translation_m:g} m of the reference on each axis."
+        f"{found.translation_m:g} m of the reference on each axis{told}."
     )
     yield (
         "Mean absolute errors in vehicle axes (of the camera, where no vehicle frame is known); (15) and "

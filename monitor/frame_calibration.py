@@ -1,5 +1,6 @@
 """One frame calibrated from a start, timed, and held against its truth: what evaluations share."""
 
+import dataclasses
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,10 +8,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from monitor.calibrating import FOUND
 from monitor.clock import Clock
 from monitor.evaluated_frames import EvaluatedFrame
-from pipeline import se3
+from monitor.first_guess import PriorSigma, masks_of_network
+from pipeline import no_prior, se3
 from pipeline.calibration import Calibrated, CalibrationParameters, Calibrator
+from pipeline.frame_modes import Prior
+from pipeline.masks import horizon_line
+from pipeline.no_prior import FoundExtrinsic, find_extrinsic
 from pipeline.parameters import Parameters
 from pipeline.records import Floats
 from pipeline.segmentation import Segmenter
@@ -35,11 +41,46 @@ class Stopwatch:
             self.ms[name] = self.ms.get(name, 0.0) + took
 
 
-def calibrated(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, times: Stopwatch) -> Calibrated:
-    """What ``calibwatch calibrate`` makes of a frame from the extrinsic of a mount as first guess."""
-    calibrator = Calibrator(mount, Parameters(), segmenter, CalibrationParameters())
+def calibrated(
+    frame: EvaluatedFrame,
+    mount: Mount,
+    segmenter: Segmenter,
+    times: Stopwatch,
+    prior_sigma: PriorSigma | None = None,
+) -> Calibrated:
+    """What ``calibwatch calibrate`` makes of a frame from the extrinsic of a mount.
+
+    Args:
+        frame: The frame.
+        mount: With the stored extrinsic.
+        segmenter: The network.
+        times: Of the stages.
+        prior_sigma: ``--prior-sigma``, how far off the extrinsic may be; None: it is a first guess.
+    """
+    prior = Prior()
+    if prior_sigma is not None:
+        with times.stage("first guess"):
+            mount = _guessed(frame, mount, segmenter, prior_sigma)
+        prior = FOUND
+    calibrator = Calibrator(mount, Parameters(), segmenter, CalibrationParameters(prior=prior))
     calibrator.step(frame.pair, times.stage)
     return calibrator.finish(times.stage)
+
+
+def _guessed(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, sigma: PriorSigma) -> Mount:
+    """The mount with what is found around its extrinsic; as it is where that is nothing."""
+    horizon = horizon_line(mount.camera, mount.R_vehicle_cam[2])
+    found = find_extrinsic(
+        frame.pair.cloud,
+        frame.pair.image,
+        masks_of_network(segmenter, frame.pair, horizon),
+        mount.camera,
+        np.random.default_rng([Parameters().seed, 0]),
+        prior=no_prior.Prior(mount.T_cam_lidar, sigma.sigma_rad, sigma.sigma_m),
+    )
+    if not isinstance(found, FoundExtrinsic):
+        return mount
+    return dataclasses.replace(mount, T_cam_lidar=found.T_cam_lidar)
 
 
 def drawn_start(frame: EvaluatedFrame, start: int, widest: Floats, seed: int) -> Floats:

@@ -1,5 +1,6 @@
 """``calibwatch evaluate``: measured on data whose truth is known."""
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -217,7 +218,7 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
 @command.command(
     name="dataset",
     epilog="Examples: calibwatch evaluate dataset kitti/ rig_b/ --out out/crlf; "
-    "calibwatch evaluate dataset --simulated 30 --rotation 6 --translation 1",
+    "calibwatch evaluate dataset --simulated 30 --rotation 6 --translation 1 --prior-sigma 3 0.5",
 )
 @click.argument("places", metavar="[DIR]...", nargs=-1, type=click.Path(path_type=Path))
 @_frame_options(starts=3)
@@ -236,6 +237,13 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
     help="Starts are off by up to so many metres along each axis.",
 )
 @click.option(
+    "--prior-sigma",
+    type=(click.FloatRange(0.0, 180.0, min_open=True), click.FloatRange(0.0, 180.0, min_open=True)),
+    metavar="DEG M",
+    help="Tell calibrate by how much starts may be off, as its option of this name does; default: it takes "
+    "them for first guesses.",
+)
+@click.option(
     "--reference-sigma",
     type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.0, 1.0)),
     metavar="DEG M",
@@ -251,6 +259,7 @@ def dataset_command(
     starts: int,
     rotation: float,
     translation: float,
+    prior_sigma: tuple[float, float] | None,
     reference_sigma: tuple[float, float],
     seed: int,
     model: Path | None,
@@ -266,12 +275,14 @@ def dataset_command(
     from monitor.clock import SystemClock  # noqa: PLC0415 - loaded with the rest
     from monitor.dataset_evaluation import Options, evaluate  # noqa: PLC0415 - numpy is not needed for --help
     from monitor.dataset_tables import dataset_picture, dataset_text  # noqa: PLC0415 - likewise
+    from monitor.first_guess import PriorSigma  # noqa: PLC0415 - likewise
     from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
 
     chosen = _frames_of(places, simulated, frames, reference_sigma, seed)
     folder = _made(out)
     segmenter = open_segmenter(model, 1)
-    options = Options(starts, rotation, translation, seed)
+    told = None if prior_sigma is None else PriorSigma(math.radians(prior_sigma[0]), prior_sigma[1])
+    options = Options(starts, rotation, translation, seed, told)
     found = evaluate(chosen, segmenter, options, SystemClock(), _progress)
     _clear()
     picture = None if folder is None else dataset_picture(found)

@@ -1,14 +1,19 @@
-"""The ground plane of a sweep in an arbitrary LiDAR frame, by RANSAC and least squares (FORMULAS B, ground).
+"""The ground of a sweep in an arbitrary LiDAR frame, by RANSAC and least squares (FORMULAS B, ground).
 
 The plane is sought among the lowest points of square cells, so that near rings, which hold most points, count
-no more than the road further away, and roofs and tree crowns do not count at all.
+no more than the road further away, and roofs and tree crowns do not count at all. Where one plane is not
+enough, on crests, ramps, cambers and pavements, further planes join it (CRLF III-B), each for its own cells.
 """
 
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 
 from pipeline.records import Floats, PointCloud, read_only
 
@@ -36,27 +41,88 @@ MIN_CELLS = 20
 MIN_SHARE = 0.2
 """Share of the cells that must support the plane: below it any cloud of clutter has one by chance."""
 
+MOST_PLANES = 5
+"""Planes in all: the road, what it goes over into ahead and behind, and a pavement on both sides."""
+
+STEP_M = 0.15
+"""m; a usual kerb. Two planes of one ground meet between cells side by side or differ by less there."""
+
+BARE_SHARE = 0.5
+"""Share of a cell's points within the band above its lowest one, at least, where it may be bare ground:
+hedges, walls and vehicles go on upwards."""
+
+NEIGHBOUR_M = 6.0
+"""m between cells side by side: beyond 30 m rings of a 64-beam sensor lie 4 m apart and more."""
+
+MIN_FURTHER_CELLS = 12
+"""Cells of a further plane, at least: 48 m^2."""
+
+DENSE_SHARE = 0.5
+"""Share of the cells beside one of a further plane that are on it too: of clutter a tenth is by chance."""
+
+_FURTHER_TRIES = 6
+"""Further planes with most cells that are asked whether they go on from the ground."""
+
 _REFITS = 3
 """Least-squares rounds; the second moves the plane by millimetres, the third by less than one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Relief:
+    """The planes of a ground that one plane does not do for, in the LiDAR frame.
+
+    Attributes:
+        planes: float64 (K,4), normals and offsets, the main plane first.
+        basis: float64 (2,3), directions of the plan over which the parts are told.
+        part: int64 (S,S), row of ``planes`` for each cell of the plan, ``CELL_M`` wide, the sensor in its
+            middle; beyond ``RANGE_M`` the outermost cells go on.
+    """
+
+    planes: Floats
+    basis: Floats
+    part: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def heights(self, xyz: np.ndarray) -> Floats:
+        """Heights above the plane of each one's place, float64 (N,), metres, of points (N,3)."""
+        first, second = self.basis.astype(xyz.dtype)
+        part = np.take(self.part, _row(xyz @ second) * _side() + _row(xyz @ first))
+        heights = np.asarray(xyz @ self.planes[0, :3].astype(xyz.dtype) + xyz.dtype.type(self.planes[0, 3]))
+        for k in range(1, len(self.planes)):
+            on = np.flatnonzero(part == k)
+            heights[on] = xyz[on] @ self.planes[k, :3] + self.planes[k, 3]
+        return np.asarray(heights, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """A fitted ground plane ``normal . p + offset = 0``.
+    """A fitted ground: its main plane ``normal . p + offset = 0``, and its relief where that does not do.
 
     Attributes:
         normal: float64 (3,), unit, LiDAR frame, pointing up.
-        offset: m; height of the LiDAR's origin above the plane.
-        inliers: bool (N,), points of the cloud within the band, at any range.
+        offset: m; height of the LiDAR's origin above the main plane.
+        inliers: bool (N,), points of the cloud within the band about the main plane or that of their place.
+        relief: Planes of its parts, of the frame in which it was fitted; None where the main plane does.
     """
 
     normal: Floats
     offset: float
     inliers: NDArray[np.bool_]
+    relief: Relief | None = None
 
     def heights(self, xyz: np.ndarray) -> Floats:
-        """Heights above the plane, float64 (N,), metres, of points (N,3) in the LiDAR frame."""
+        """Heights above the main plane, float64 (N,), metres, of points (N,3) in the LiDAR frame."""
         return np.asarray(xyz @ self.normal + self.offset, dtype=np.float64)
+
+    def local_heights(self, xyz: np.ndarray) -> Floats:
+        """Heights above the ground of each one's place, float64 (N,), metres, of points (N,3).
+
+        The points are of the frame in which the ground was fitted.
+        """
+        return self.heights(xyz) if self.relief is None else self.relief.heights(xyz)
 
 
 def plane_basis(normal: Floats) -> Floats:
@@ -98,23 +164,156 @@ def fit_ground(cloud: PointCloud, up: Floats, rng: np.random.Generator) -> Groun
         if len(means) < max(MIN_CELLS, MIN_SHARE * len(lowest)):
             return None
         plane = _least_squares(means, up)
+    bare = _bare(points @ up, cell)[_lowest_of_cells(cell, points @ up)]
+    planes = _further_planes(points, cell, lowest[bare], plane, up, rng)
+    relief = _relief(planes, lowest[bare], plane_basis(up))
     normal, offset = plane[:3], float(plane[3])
-    distance = cloud.xyz @ normal.astype(np.float32) + np.float32(offset)
-    return Ground(read_only(normal), offset, read_only(np.abs(distance) <= BAND_M / 2))
+    inliers = np.abs(cloud.xyz @ normal.astype(np.float32) + np.float32(offset)) <= BAND_M / 2
+    if relief is not None:
+        inliers |= np.abs(relief.heights(cloud.xyz)) <= BAND_M / 2
+    return Ground(read_only(normal), offset, read_only(inliers), relief)
+
+
+def _bare(height: Floats, cell: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each point (N,) lies in a cell most of whose points are as low as its lowest one."""
+    lowest = np.full(int(cell.max(initial=0)) + 1, np.inf)
+    np.minimum.at(lowest, cell, height)
+    low = np.bincount(cell[height <= lowest[cell] + BAND_M], minlength=len(lowest))
+    share = low / np.maximum(np.bincount(cell, minlength=len(lowest)), 1)
+    return np.asarray((share >= BARE_SHARE)[cell])
+
+
+def _further_planes(
+    points: Floats,
+    cell: NDArray[np.int64],
+    lowest: Floats,
+    plane: Floats,
+    up: Floats,
+    rng: np.random.Generator,
+) -> Floats:
+    """The main plane and those that go on from it (K,4), of bare cells with lowest points (M,3)."""
+    planes = plane[None]
+    while len(planes) < MOST_PLANES:
+        heights = lowest @ planes[:, :3].T + planes[:, 3]
+        ground = np.abs(heights).min(axis=1) <= BAND_M / 2
+        rest = lowest[~ground]
+        if len(rest) < MIN_FURTHER_CELLS:
+            break
+        known = _Known(lowest[ground], planes[np.abs(heights[ground]).argmin(axis=1)])
+        found = _further_plane(rest, known, up, rng)
+        if found is None:
+            break
+        free = (np.abs(points @ planes[:, :3].T + planes[:, 3]) > BAND_M / 2).all(axis=1)
+        refined = _refined(points[free], cell[free], found, up)
+        if refined is None:
+            break
+        on = np.flatnonzero(np.abs(rest @ refined[:3] + refined[3]) <= BAND_M / 2)
+        if refined[:3] @ up < math.cos(MAX_TILT) or not _goes_on(rest[on], refined, known):
+            break
+        planes = np.vstack([planes, refined])
+    return planes
+
+
+def _refined(points: Floats, cell: NDArray[np.int64], plane: Floats, up: Floats) -> Floats | None:
+    """The plane (4,) of least squares on the points (N,3) in its band; None where it is of too few cells."""
+    for _ in range(_REFITS):
+        means = _cell_means(points, cell, np.abs(points @ plane[:3] + plane[3]) <= BAND_M / 2)
+        if len(means) < MIN_FURTHER_CELLS:
+            return None
+        plane = _least_squares(means, up)
+    return plane
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """Lowest points (G,3) of cells of the ground, and their planes (G,4)."""
+
+    points: Floats
+    planes: Floats
+
+
+def _further_plane(rest: Floats, known: _Known, up: Floats, rng: np.random.Generator) -> Floats | None:
+    """The plane (4,) with most cells (M,3) side by side that goes on from the ground."""
+    planes, support = _hypotheses(rest, up, rng)
+    order = np.argsort(support.sum(axis=0), kind="stable")[::-1][:_FURTHER_TRIES]
+    if len(order) == 0 or int(support[:, order[0]].sum()) < MIN_FURTHER_CELLS:
+        return None
+    beside = (cdist(rest, rest) <= NEIGHBOUR_M).astype(np.float32)
+    crowd = beside.sum(axis=1)
+    best, most = None, MIN_FURTHER_CELLS - 1
+    for k in order.tolist():
+        on = support[:, k]
+        dense = on & (beside @ on.astype(np.float32) >= DENSE_SHARE * crowd)
+        if int(dense.sum()) <= most:
+            continue
+        dense = _largest(dense, beside)
+        if int(dense.sum()) > most and _goes_on(rest[dense], planes[k], known):
+            best, most = planes[k], int(dense.sum())
+    return best
+
+
+def _largest(chosen: NDArray[np.bool_], beside: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Of the chosen cells (M,) those of the largest group side by side (M,M): a crest falls off both ways."""
+    index = np.flatnonzero(chosen)
+    label = connected_components(csr_array(beside[np.ix_(index, index)]), directed=False)[1]
+    largest = np.zeros_like(chosen)
+    if len(index):
+        largest[index[label == np.bincount(label).argmax()]] = True
+    return largest
+
+
+def _goes_on(points: Floats, plane: Floats, known: _Known) -> bool:
+    """Whether a plane (4,) meets the ground between its own cells (M,3) and those of the ground beside."""
+    rows, columns = np.nonzero(cdist(points, known.points) <= NEIGHBOUR_M)
+    if len(rows) == 0:
+        return False
+    # Heights of the new plane over the old one at both cells of each pair: it crosses, or is a low step.
+    at_known = -(known.points[columns] @ plane[:3] + plane[3])
+    old = known.planes[columns]
+    at_new = np.einsum("ni,ni->n", points[rows], old[:, :3]) + old[:, 3]
+    meets = (at_known * at_new <= 0) | (np.minimum(np.abs(at_known), np.abs(at_new)) <= STEP_M)
+    return bool(meets.mean() >= DENSE_SHARE)
+
+
+def _relief(planes: Floats, lowest: Floats, basis: Floats) -> Relief | None:
+    """The plane of each cell of the plan: of ground cells the nearest one, elsewhere as beside it."""
+    side = _side()
+    if len(planes) == 1:
+        return None
+    away = np.abs(lowest @ planes[:, :3].T + planes[:, 3])
+    ground = away.min(axis=1) <= BAND_M / 2
+    column, row = (_row(lowest[ground] @ direction) for direction in basis)
+    empty = np.ones((side, side), dtype=np.uint8)
+    empty[row, column] = 0
+    plane = np.zeros((side, side), dtype=np.int64)
+    plane[row, column] = away[ground].argmin(axis=1)
+    _, label = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    of_label = np.zeros(int(label.max()) + 1, dtype=np.int64)
+    of_label[label[row, column]] = plane[row, column]
+    return Relief(planes, basis, of_label[label])
+
+
+def _side() -> int:
+    """Cells along a side of the plan."""
+    return 2 * math.ceil(RANGE_M / CELL_M) + 1
+
+
+def _row(place: np.ndarray) -> NDArray[np.int64]:
+    """Row or column (N,) of the plan's grid for coordinates (N,) of it, m; those beyond get the outermost."""
+    return np.asarray(np.clip((place + RANGE_M) / CELL_M, 0, _side() - 1).astype(np.int64))
 
 
 def _cells(plan: Floats) -> NDArray[np.int64]:
     """Index (N,) of the cell in which each point (N,2) of the plan lies."""
-    side = 2 * math.ceil(RANGE_M / CELL_M)
-    column = np.floor((plan + RANGE_M) / CELL_M).astype(np.int64)
-    return np.asarray(column[:, 0] * (side + 1) + column[:, 1])
+    return _row(plan[:, 0]) * _side() + _row(plan[:, 1])
 
 
 def _lowest_of_cells(cell: NDArray[np.int64], height: Floats) -> NDArray[np.int64]:
     """Index of the lowest point of each occupied cell."""
     lowest = np.full(int(cell.max(initial=0)) + 1, np.inf)
     np.minimum.at(lowest, cell, height)
-    return np.flatnonzero(height == lowest[cell])
+    tied = np.flatnonzero(height == lowest[cell])
+    return tied[np.unique(cell[tied], return_index=True)[1]]
 
 
 def _cell_means(points: Floats, cell: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
@@ -127,6 +326,14 @@ def _cell_means(points: Floats, cell: NDArray[np.int64], chosen: NDArray[np.bool
 
 def _best_plane(points: Floats, up: Floats, rng: np.random.Generator) -> Floats | None:
     """The plane (4,) through three of the points (M,3) with most in its band; None if all are steep."""
+    planes, support = _hypotheses(points, up, rng)
+    if len(planes) == 0:
+        return None
+    return np.asarray(planes[int(np.argmax(support.sum(axis=0)))])
+
+
+def _hypotheses(points: Floats, up: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """Level planes (H,4) through three of the points (M,3), and which points lie in their bands (M,H)."""
     triple = points[rng.integers(0, len(points), (HYPOTHESES, 3))]
     normal = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -134,13 +341,9 @@ def _best_plane(points: Floats, up: Floats, rng: np.random.Generator) -> Floats 
     level = np.abs(along_up) >= math.cos(MAX_TILT) * length
     # Triples on one line span no plane; one square metre is a quarter of a cell.
     level &= length > CELL_M * CELL_M / 4
-    if not level.any():
-        return None
     normal = normal[level] * (np.sign(along_up[level]) / length[level])[:, None]
     offset = -np.einsum("ij,ij->i", normal, triple[level, 0])
-    support = (np.abs(points @ normal.T + offset) <= BAND_M / 2).sum(axis=0)
-    best = int(np.argmax(support))
-    return np.append(normal[best], offset[best])
+    return np.column_stack([normal, offset]), np.abs(points @ normal.T + offset) <= BAND_M / 2
 
 
 def _least_squares(points: Floats, up: Floats) -> Floats:

@@ -63,6 +63,100 @@ def test_turning_the_lidar_turns_the_plane(seed):
     assert ground.offset == pytest.approx(1.7 - 0.4 * normal[2], abs=0.02)
 
 
+def rolling(rng, shape, *, height=1.7, noise=0.02, rings=40):
+    """Rings of a sensor over a road of ``shape(x, y)`` m between hedges, walls and parked cars.
+
+    Returns xyz and whether each point is ground.
+    """
+    angle = np.tile(np.arange(0.0, 2 * np.pi, 0.01), rings)
+    down = np.tan(np.radians(np.linspace(1.8, 24.0, rings)).repeat(len(angle) // rings))
+    # Where each beam first passes below the road.
+    steps = np.arange(2.0, 60.0, 0.2)
+    reach = np.full(len(angle), 60.0)
+    for step in steps[::-1]:
+        below = height - step * down < shape(step * np.cos(angle), step * np.sin(angle))
+        reach[below] = step
+    reach -= rng.uniform(0.0, 0.2, len(angle))
+    x, y = reach * np.cos(angle), reach * np.sin(angle)
+    on_road = (np.abs(y) < 7.0) & (reach < 58)
+    road = np.column_stack([x, y, shape(x, y)])[on_road]
+    count = 6000
+    along = rng.uniform(-40, 40, count)
+    side = rng.choice([-7.5, 7.5], count)
+    hedge = np.column_stack([along, side + rng.normal(0, 0.3, count), rng.uniform(0.0, 1.3, count)])
+    cars = np.column_stack(
+        [rng.uniform(-35, 35, count), rng.choice([-5.5, 5.5], count), rng.uniform(0.25, 1.5, count)]
+    )
+    wall = np.column_stack([along, 1.2 * side, rng.uniform(0.0, 6.0, count)])
+    for thing in (hedge, cars, wall):
+        thing[:, 2] += shape(thing[:, 0], thing[:, 1])
+    xyz = np.concatenate([road, hedge, cars[np.abs(cars[:, 0] % 6) < 4], wall]) - [0, 0, height]
+    xyz[:, 2] += rng.normal(0, noise, len(xyz))
+    return xyz, np.arange(len(xyz)) < len(road)
+
+
+SHAPES = {
+    "flat": lambda x, y: 0.0 * (x + y),
+    "ramp of 2 %": lambda x, y: 0.02 * np.maximum(x - 8.0, 0.0) + 0.0 * y,
+    "ramp of 5 %": lambda x, y: 0.05 * np.maximum(x - 12.0, 0.0) + 0.0 * y,
+    "crest": lambda x, y: -(x**2) / (2 * 600.0) + 0.0 * y,
+    "dip": lambda x, y: x**2 / (2 * 800.0) + 0.0 * y,
+    "camber of 4 %": lambda x, y: -0.04 * np.abs(y) + 0.0 * x,
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_slopes_crests_and_cambers_are_ground(name):
+    rng = np.random.default_rng(4)
+    xyz, is_road = rolling(rng, SHAPES[name])
+    ground = fit_ground(PointCloud(xyz.astype(np.float32)), UP, rng)
+    assert ground is not None
+    near = np.hypot(xyz[:, 0], xyz[:, 1]) < 40
+    plane_alone = (np.abs(ground.heights(xyz))[is_road & near] <= BAND_M / 2).mean()
+    share = ground.inliers[is_road & near].mean()
+    assert share > (0.97 if name == "flat" or "ramp" in name else 0.8)
+    assert share - plane_alone >= (0.0 if name == "flat" else 0.015)
+    # A lump of hedge or car within the band is no ground to speak of; the rest of them is none.
+    height = xyz[:, 2] + 1.7 - SHAPES[name](xyz[:, 0], xyz[:, 1])
+    assert ground.inliers[~is_road & near & (height > 0.3)].mean() < 0.07
+    error = ground.local_heights(xyz) - height
+    assert np.sqrt((error[is_road & near] ** 2).mean()) < 0.08
+    assert np.abs(error[~is_road & near]).max() < 0.35
+    assert (ground.relief is None) == (name == "flat")
+
+
+def test_a_ramp_is_ground_in_any_frame():
+    rng = np.random.default_rng(6)
+    turn = se3.exp_so3(np.array([0.5, -2.0, 0.7]))
+    xyz, is_road = rolling(rng, SHAPES["ramp of 5 %"])
+    near = np.hypot(xyz[:, 0], xyz[:, 1]) < 40
+    ground = fit_ground(PointCloud((xyz @ turn.T).astype(np.float32)), turn @ UP, rng)
+    assert ground.inliers[is_road & near].mean() > 0.97
+
+
+@pytest.mark.parametrize("kerb", [0.08, 0.15])
+def test_a_pavement_beside_the_road_is_ground(kerb):
+    rng = np.random.default_rng(7)
+    xyz, is_ground = rolling(rng, lambda x, y: kerb * (np.abs(y) > 4.0) + 0.0 * x)
+    ground = fit_ground(PointCloud(xyz.astype(np.float32)), UP, rng)
+    near = np.hypot(xyz[:, 0], xyz[:, 1]) < 30
+    assert ground.inliers[is_ground & near].mean() > 0.97
+
+
+@pytest.mark.parametrize("top", [0.6, 1.0, 1.5])
+def test_a_level_top_beside_the_road_is_no_ground(top):
+    """A row of flat boxes, a wide hedge, a loading ramp: the road does not go over into them."""
+    rng = np.random.default_rng(8)
+    xyz, is_road = rolling(rng, SHAPES["flat"])
+    box = np.column_stack(
+        [rng.uniform(-30, 30, 20_000), rng.uniform(7.0, 13.0, 20_000), np.full(20_000, top - 1.7)]
+    )
+    whole = np.concatenate([xyz, box])
+    ground = fit_ground(PointCloud(whole.astype(np.float32)), UP, rng)
+    assert not ground.inliers[len(xyz) :].any()
+    assert ground.inliers[: len(xyz)][is_road].mean() > 0.97
+
+
 @pytest.mark.parametrize("tilt_deg", [10.0, 25.0])
 def test_planes_steeper_than_the_tolerance_are_refused(tilt_deg):
     rng = np.random.default_rng(5)

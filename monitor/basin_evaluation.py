@@ -11,17 +11,14 @@ from pydantic import BaseModel, ConfigDict
 from monitor.clock import Clock
 from monitor.evaluated_frames import EvaluatedFrame, EvaluatedFrames
 from monitor.first_guess import PriorSigma, masks_of_network
-from monitor.frame_calibration import Stopwatch, calibrated
+from monitor.frame_calibration import Stopwatch, calibrated, lines_around
 from pipeline import basin, se3
 from pipeline.association import associate
 from pipeline.basin import OFFSETS, BasinScene, Sweep
-from pipeline.cloud_lanes import find_lanes
-from pipeline.cloud_poles import find_poles
-from pipeline.ground import fit_ground
 from pipeline.height_maps import height_maps
 from pipeline.line_witness import find_lines
 from pipeline.masks import horizon_line
-from pipeline.records import CloudLine, Floats
+from pipeline.records import Floats
 from pipeline.segmentation import Segmenter
 from pipeline.semantic_cost import points_of_lines
 
@@ -125,7 +122,7 @@ def scene_of(frame: EvaluatedFrame, segmenter: Segmenter, rng: np.random.Generat
     mount, pair, camera = frame.mount, frame.pair, frame.camera
     up_cam = mount.T_cam_lidar[:3, :3] @ mount.up
     masks = masks_of_network(segmenter, pair, horizon_line(camera, up_cam))
-    ground = fit_ground(pair.cloud, mount.up, rng)
+    around, ground = lines_around(frame, rng)
     lines = find_lines(
         pair.cloud,
         pair.image,
@@ -138,13 +135,6 @@ def scene_of(frame: EvaluatedFrame, segmenter: Segmenter, rng: np.random.Generat
         ground=ground,
     )
     known = associate(lines.cloud_lines, lines.image_lines, camera, mount.T_cam_lidar, _MATCHED)
-    around: list[CloudLine] = []
-    if ground is not None:
-        everywhere = np.ones(len(pair.cloud), dtype=bool)
-        around = [
-            *find_lanes(pair.cloud, ground, everywhere, rng),
-            *find_poles(pair.cloud, ground, everywhere),
-        ]
     return BasinScene(
         camera,
         known.pairs,

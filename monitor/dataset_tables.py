@@ -157,14 +157,23 @@ def _cell(answer: Answer, name: AxisName) -> str:
 
 
 def _times(found: Dataset) -> Iterator[str]:
-    yield "Median wall time of an answer, ms; of the coarse stage after masks, of one frame."
+    yield (
+        "Median wall time, ms. A frame, in the rows of CRLF's Table I: masks (network and CRF), lanes and "
+        "poles of image and cloud (the whole turn), coarse without a prior (its lines among it). An answer: "
+        "the stages of calibrate, and all of it."
+    )
     yield ""
-    stages = list(dict.fromkeys(stage for one in found.summaries for stage in one.ms if stage != "all"))
-    yield f"| set | {' | '.join(stages)} | all | coarse |"
-    yield "|---|" + "---|" * (len(stages) + 2)
+    of_frame = list(dict.fromkeys(stage for one in found.coarse_summaries for stage in one.ms))
+    of_answer = list(dict.fromkeys(stage for one in found.summaries for stage in one.ms))
+    yield f"| set | {' | '.join([*of_frame, *of_answer])} |"
+    yield "|---|" + "---|" * len([*of_frame, *of_answer])
     for one, coarse in zip(found.summaries, found.coarse_summaries, strict=True):
-        cells = " | ".join(f"{one.ms[stage]:.0f}" if stage in one.ms else "-" for stage in [*stages, "all"])
-        yield f"| {one.group} | {cells} | {coarse.ms:.0f} |"
+        cells = [
+            f"{ms[stage]:.0f}" if stage in ms else "-"
+            for ms, stages in ((coarse.ms, of_frame), (one.ms, of_answer))
+            for stage in stages
+        ]
+        yield f"| {one.group} | {' | '.join(cells)} |"
 
 
 def dataset_picture(found: Dataset) -> bytes:

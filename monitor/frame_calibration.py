@@ -14,11 +14,14 @@ from monitor.evaluated_frames import EvaluatedFrame
 from monitor.first_guess import PriorSigma, masks_of_network
 from pipeline import no_prior, se3
 from pipeline.calibration import Calibrated, CalibrationParameters, Calibrator
+from pipeline.cloud_lanes import find_lanes
+from pipeline.cloud_poles import find_poles
 from pipeline.frame_modes import Prior
+from pipeline.ground import Ground, fit_ground
 from pipeline.masks import horizon_line
 from pipeline.no_prior import FoundExtrinsic, find_extrinsic
 from pipeline.parameters import Parameters
-from pipeline.records import Floats
+from pipeline.records import CloudLine, Floats
 from pipeline.segmentation import Segmenter
 from pipeline.watch import Mount
 
@@ -81,6 +84,16 @@ def _guessed(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, sigma: P
     if not isinstance(found, FoundExtrinsic):
         return mount
     return dataclasses.replace(mount, T_cam_lidar=found.T_cam_lidar)
+
+
+def lines_around(frame: EvaluatedFrame, rng: np.random.Generator) -> tuple[list[CloudLine], Ground | None]:
+    """Lanes and poles of the whole turn of a frame's LiDAR, and the ground that they stand on."""
+    cloud = frame.pair.cloud
+    ground = fit_ground(cloud, frame.mount.up, rng)
+    if ground is None:
+        return [], None
+    everywhere = np.ones(len(cloud), dtype=np.bool_)
+    return [*find_lanes(cloud, ground, everywhere, rng), *find_poles(cloud, ground, everywhere)], ground
 
 
 def drawn_start(frame: EvaluatedFrame, start: int, widest: Floats, seed: int) -> Floats:

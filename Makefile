@@ -10,7 +10,7 @@ OUT ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: env demo test test-full lint bench train export scenes figures-masks figures-plk clean
+.PHONY: env demo test test-full lint bench train export scenes figures-masks figures-plk figures-crlf clean
 
 env: $(STAMP)
 
@@ -83,6 +83,17 @@ figures-plk: env
 	$(BIN)/calibwatch evaluate plk-table1 --out $(OUT)/plk
 	$(BIN)/calibwatch evaluate plk-fig5 --out $(OUT)/plk
 	$(BIN)/calibwatch evaluate plk-fig6 --out $(OUT)/plk
+
+# Recorded frames are read where they are; the rest is simulated. Some 25 minutes of an idle core.
+CALIBWATCH_DATA ?= ../shared/data
+figures-crlf: env
+	rm -rf $(OUT)/crlf
+	$(BIN)/calibwatch evaluate dataset --simulated 30 --starts 2 --out $(OUT)/crlf/near
+	$(BIN)/calibwatch evaluate dataset --simulated 30 --starts 2 --rotation 6 --translation 1 --prior-sigma 3 0.5 \
+		--out $(OUT)/crlf/far
+	$(if $(wildcard $(CALIBWATCH_DATA)),$(BIN)/calibwatch evaluate dataset $(CALIBWATCH_DATA) --out $(OUT)/crlf/recorded)
+	$(BIN)/calibwatch evaluate basin --simulated 6 --out $(OUT)/crlf/basin
+	$(BIN)/python docs/crlf_page.py $(OUT)/crlf docs
 
 clean:
 	rm -rf $(VENV) $(TRAIN) $(OUT) build *.egg-info

@@ -23,7 +23,9 @@ BRIGHT = 128
 UPRIGHT = math.radians(20.0)
 """rad; poles lean less in the image of an upright camera, also beside the middle of a wide lens."""
 SLENDER = 3.0
-"""Length over width of a pole's piece, at least; a mark above the horizon is neither lane nor pole."""
+"""Length over width of an upright piece, at least."""
+MOSTLY = 0.5
+"""Share of a piece below the horizon under which it is a pole, with arms and lamps of whatever shape."""
 LEAST_PX = 8
 """px; smaller pieces are noise of the compression."""
 SAME_SHAPE = 0.01
@@ -67,7 +69,7 @@ def _named(values: NDArray[np.uint8]) -> bool:
 def _told_apart(
     lines: NDArray[np.bool_], camera: CameraModel, scale: tuple[float, float], horizon: Floats | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Lanes and poles (h,w): poles are upright pieces that rise above the horizon, lanes lie below it."""
+    """Lanes and poles (h,w): pieces above the horizon and upright ones across it are poles."""
     line = np.array([0.0, 1.0, -camera.K[1, 2]]) if horizon is None else horizon
     count, pieces = cv2.connectedComponents(lines.astype(np.uint8), connectivity=8)
     rows, columns = np.nonzero(pieces)
@@ -79,10 +81,10 @@ def _told_apart(
     for part in np.split(order, np.flatnonzero(np.diff(owner[order])) + 1):
         if len(part) < LEAST_PX:
             continue
-        if _stands(ideal_pixels(camera, raw[part])) and not ground_side[part].all():
-            kind[owner[part[0]]] = labels.POLE
-        elif ground_side[part].mean() > 0.5:  # noqa: PLR2004 - most of it
-            kind[owner[part[0]]] = labels.LANE
+        below = float(ground_side[part].mean())
+        # A lane straight ahead stands upright as well, and with a camera that looks down it seems to rise.
+        rises = below < MOSTLY or (below < 1.0 and _stands(ideal_pixels(camera, raw[part])))
+        kind[owner[part[0]]] = labels.POLE if rises else labels.LANE
     found = kind[pieces]
     return found == labels.LANE, found == labels.POLE
 

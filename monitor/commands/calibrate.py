@@ -51,8 +51,8 @@ MASK_PRIOR = 2.0, 0.3
     multiple=True,
     type=click.Path(path_type=Path),
     help="Lane and pole mask of the first frame, the next of the second, in place of the network: a PNG, "
-    "JPEG or BMP of the image's shape, with values 1 lane and 2 pole, or with bright lines on black, where "
-    "upright ones that rise above the horizon are poles.",
+    "JPEG or BMP of the image's shape, with values 1 lane and 2 pole, or with bright lines on black, of "
+    "which those above the horizon, and upright ones across it, are poles.",
 )
 @commands.model_option
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")

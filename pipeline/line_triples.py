@@ -128,8 +128,10 @@ def _length(line: CloudLine | ImageLine) -> float:
 
 
 def is_usable(line: CloudLine | ImageLine) -> bool:
-    """Whether a line has ends within reach that differ."""
-    return all((np.abs(end) < OUTERMOST).all() for end in (line.start, line.end)) and _length(line) > 0.0
+    """Whether a line has ends within reach that differ, and a noise that is a number."""
+    sigma = line.sigma_m if isinstance(line, CloudLine) else line.sigma_px
+    ends = np.stack([line.start, line.end])
+    return bool((np.abs(ends) < OUTERMOST).all() and abs(sigma) < OUTERMOST and _length(line) > 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

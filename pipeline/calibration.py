@@ -17,7 +17,7 @@ from pipeline import se3
 from pipeline.edge_witness import EdgeBatch, EdgeFrame, batch_of
 from pipeline.edges import Edges, find_edges
 from pipeline.ego import Ego
-from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, find_tops, weighed
+from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, balanced, find_tops, weighed
 from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
 from pipeline.observability import MAX_SIGMA, Observability, observable
@@ -79,7 +79,9 @@ class Calibrated:
         observable: bool (6,), axes whose sigma is small enough (DESIGN 4).
         held: Directions that are not known, named, weakest first, e.g. "pitch with up".
         reason: One clause: why something is not observable, or that all is.
-        modes: The most likely first; empty where the frames have no edges.
+        modes: The most likely first; empty where the frames have too few edges.
+        contrast: Score of the first over that of chance, minus 1; 0 without modes.
+        peak: Its height over chance, in sigma of the score at random extrinsics; 0 without modes.
         frames: Number of pairs that could be used.
         dropped: How many pairs gave nothing, by reason.
     """
@@ -91,6 +93,8 @@ class Calibrated:
     held: tuple[str, ...]
     reason: str
     modes: tuple[Mode, ...]
+    contrast: float
+    peak: float
     frames: int
     dropped: dict[DropReason, int]
 
@@ -225,11 +229,13 @@ class Calibrator:
         T_guess, modes, prior = self.mount.T_cam_lidar, self._settings.modes, self._settings.prior
         rng = np.random.default_rng(self._parameters.seed)
         with stage("search"):
-            tops = find_tops(self._batch(self._kept), T_guess, prior, modes, rng)
+            batch = balanced(self._batch(self._kept), T_guess, modes, rng)
+            tops = find_tops(batch, T_guess, prior, modes, rng)
         with stage("refinement"):
             # The edges in view, and which stand for what part of it, are those of the best fit.
-            there = self._picked_again(se3.retract(T_guess, tops[0][0]))
-            found = weighed(self._batch(there), T_guess, tops, prior, modes, rng)
+            T_best = se3.retract(T_guess, tops[0][0])
+            batch = balanced(self._batch(self._picked_again(T_best)), T_best, modes, rng)
+            found = weighed(batch, T_guess, tops, prior, modes, rng)
         return self._result(found)
 
     def _picked_again(self, T_cam_lidar: Floats) -> list[_Kept]:
@@ -259,7 +265,9 @@ class Calibrator:
         )
         if found.contrast < self._settings.least_contrast or found.peak < self._settings.least_peak:
             why = "image and cloud show nothing in common (dark, blocked, no edges, or a first guess far off)"
-            return dataclasses.replace(self._nothing(why), modes=modes)
+            return dataclasses.replace(
+                self._nothing(why), modes=modes, contrast=found.contrast, peak=found.peak
+            )
         B = se3.vehicle_block(mount.R_vehicle_cam)
         covariance = B @ found.covariance @ B.T + self._parameters.test.floor()
         information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
@@ -275,6 +283,8 @@ class Calibrator:
             held=held,
             reason=f"held: {', '.join(held)}" if held else "all six axes are observable",
             modes=modes,
+            contrast=found.contrast,
+            peak=found.peak,
             frames=self.frames,
             dropped=dict(self.dropped),
         )
@@ -289,6 +299,8 @@ class Calibrator:
             held=AXES,
             reason=reason,
             modes=(),
+            contrast=0.0,
+            peak=0.0,
             frames=self.frames,
             dropped=dict(self.dropped),
         )

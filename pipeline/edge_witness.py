@@ -8,7 +8,7 @@ same car is one witness.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -97,7 +97,8 @@ NEW_SCENE_M = 20.0
 class EdgeBatch:
     """Edges of several frames in one set of arrays.
 
-    ``slot`` says which frame an edge belongs to, ``cell`` which part of the image on which stretch of road.
+    ``slot`` says which frame an edge belongs to, ``cell`` which part of the image on which stretch of road,
+    ``kind`` what it is the edge of (``edges.KIND_NAMES``).
     """
 
     position: Floats
@@ -105,6 +106,7 @@ class EdgeBatch:
     weight: Floats
     cell: NDArray[np.int64]
     slot: NDArray[np.int64]
+    kind: NDArray[np.uint8]
     stacks: tuple[NDArray[np.uint16], ...]
     scales: tuple[tuple[float, float], ...]
     camera: CameraModel
@@ -121,6 +123,7 @@ class EdgeBatch:
             weight=self.weight[::stride].copy(),
             cell=self.cell[::stride],
             slot=self.slot[::stride].copy(),
+            kind=self.kind[::stride],
         )
 
 
@@ -138,6 +141,7 @@ def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel, most_edges: int) 
             [f.edges.cell + CELLS * stretch for f, stretch in zip(frames, stretches, strict=True)]
         )[kept],
         slot=np.repeat(np.arange(len(frames)), [len(f.edges) for f in frames])[kept],
+        kind=np.concatenate([f.edges.kind for f in frames])[kept],
         stacks=tuple(
             np.stack([f.gradients.levels[level] for f in frames])
             for level in range(len(frames[0].gradients.levels))
@@ -451,12 +455,18 @@ def chance(
 ) -> tuple[float, float]:
     """Mean and standard deviation of the score at far random extrinsics."""
     batch = batch.thinned(_COARSE_STRIDE)
-    scores = []
+    scores = [float(score_only(batch, T, 0).sum()) for T in far_extrinsics(T_stored, parameters, rng)]
+    weight = float(batch.weight.sum())
+    return float(np.mean(scores)) / weight, float(np.std(scores)) / weight
+
+
+def far_extrinsics(
+    T_cam_lidar: Floats, parameters: EdgeWitnessParameters, rng: np.random.Generator
+) -> Iterator[Floats]:
+    """Random extrinsics so far from the given one that what fits there fits by chance."""
     for _ in range(parameters.contrast_starts):
         axis, shift = rng.normal(size=3), rng.normal(size=3)
         angle = rng.uniform(*parameters.contrast_rad)
         turn = axis / np.linalg.norm(axis) * angle
         xi = np.concatenate([turn, shift / np.linalg.norm(shift) * parameters.contrast_m])
-        scores.append(float(score_only(batch, se3.retract(T_stored, xi), 0).sum()))
-    weight = float(batch.weight.sum())
-    return float(np.mean(scores)) / weight, float(np.std(scores)) / weight
+        yield se3.retract(T_cam_lidar, xi)

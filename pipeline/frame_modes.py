@@ -17,7 +17,7 @@ from scipy.stats import qmc
 
 from pipeline import edge_witness, se3
 from pipeline.edge_witness import UNITS, EdgeBatch, EdgeWitnessParameters
-from pipeline.edges import CELL_COLUMNS, CELLS
+from pipeline.edges import CELL_COLUMNS, CELLS, KIND_NAMES
 from pipeline.records import Floats
 
 Top: TypeAlias = tuple[Floats, float]
@@ -98,6 +98,38 @@ class EdgeModes:
     peak: float
 
 
+def balanced(
+    batch: EdgeBatch, T_cam_lidar: Floats, parameters: ModeParameters, rng: np.random.Generator
+) -> EdgeBatch:
+    """The same edges, each kind with the weight by which it tells a fit from chance.
+
+    Upright edges are many, but slide along what is upright in the image: under them a wrong pitch fits as
+    well as the right one, or better. The mean response of a kind scatters by chance, from place to place,
+    with a variance that says how many independent edges the kind is worth; its inverse is the kind's weight
+    (of independent means with a common signal that sum is the best one).
+
+    Args:
+        batch: Edges and gradients.
+        T_cam_lidar: float64 (4,4), around which chance is asked.
+        parameters: See there.
+        rng: Draws places.
+    """
+    plain = dataclasses.replace(batch, weight=np.ones(len(batch)))
+    places = edge_witness.far_extrinsics(T_cam_lidar, parameters.edge_witness, rng)
+    responses = np.stack([edge_witness.score_only(plain, T, 0) for T in places])
+    weight = np.zeros(len(batch))
+    for kind in range(len(KIND_NAMES)):
+        of_kind = batch.kind == kind
+        count = int(of_kind.sum())
+        if count == 0:
+            continue
+        seen = responses[:, of_kind]
+        # A mean of n can not scatter less than n independent ones do; a few places may not show it.
+        variance = max(float(np.var(seen.mean(axis=1))), float(np.var(seen, axis=1).mean()) / count, 1e-12)
+        weight[of_kind] = 1.0 / (variance * count)
+    return dataclasses.replace(batch, weight=weight / weight.mean())
+
+
 def weighed(
     batch: EdgeBatch,
     T_guess: Floats,
@@ -128,7 +160,7 @@ def weighed(
     tops, shares = [tops[k] for k in order], shares[order]
     offset = np.stack([xi - tops[0][0] for xi, _ in tops])
     rivals = (offset * shares[:, None]).T @ offset
-    chance, spread = edge_witness.chance(batch, T_guess, parameters.edge_witness, rng)
+    chance, spread = _chance(batch, se3.retract(T_guess, tops[0][0]), parameters, rng)
     return EdgeModes(
         tops=tuple(tops),
         shares=shares,
@@ -230,6 +262,15 @@ def _keep(tops: list[Top], top: Top, apart: float) -> None:
                 tops[index] = top
             return
     tops.append(top)
+
+
+def _chance(
+    batch: EdgeBatch, T_best: Floats, parameters: ModeParameters, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Mean and standard deviation of the score at random extrinsics far from the best."""
+    places = edge_witness.far_extrinsics(T_best, parameters.edge_witness, rng)
+    scores = np.array([edge_witness.score_only(batch, T, 0).sum() for T in places]) / batch.weight.sum()
+    return float(scores.mean()), float(scores.std())
 
 
 _PART_CELLS = 2

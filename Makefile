@@ -88,11 +88,11 @@ figures-plk: env
 CALIBWATCH_DATA ?= ../shared/data
 figures-crlf: env
 	rm -rf $(OUT)/crlf
-	$(BIN)/calibwatch evaluate dataset --simulated 30 --starts 2 --out $(OUT)/crlf/near
-	$(BIN)/calibwatch evaluate dataset --simulated 30 --starts 2 --rotation 6 --translation 1 --prior-sigma 3 0.5 \
+	$(BIN)/calibwatch evaluate dataset --simulated 30 --starts 1 --out $(OUT)/crlf/near
+	$(BIN)/calibwatch evaluate dataset --simulated 30 --starts 1 --rotation 6 --translation 1 --prior-sigma 3 0.5 \
 		--out $(OUT)/crlf/far
 	$(if $(wildcard $(CALIBWATCH_DATA)),$(BIN)/calibwatch evaluate dataset $(CALIBWATCH_DATA) --out $(OUT)/crlf/recorded)
-	$(BIN)/calibwatch evaluate basin --simulated 6 --out $(OUT)/crlf/basin
+	$(BIN)/calibwatch evaluate basin --simulated 4 --out $(OUT)/crlf/basin
 	$(BIN)/python docs/crlf_page.py $(OUT)/crlf docs
 
 clean:

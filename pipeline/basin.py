@@ -26,9 +26,9 @@ both: all six, drawn uniformly up to so much about each axis and a sixth of that
 """
 
 OFFSETS: dict[Sweep, Floats] = {
-    "rotation": read_only(np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 10.0, 16.0, 24.0, 34.0, 46.0])),
-    "translation": read_only(np.array([0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0])),
-    "both": read_only(np.radians([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])),
+    "rotation": read_only(np.radians([0.0, 2.0, 4.0, 6.0, 10.0, 16.0, 30.0, 46.0])),
+    "translation": read_only(np.array([0.0, 0.2, 0.5, 1.0, 2.0, 3.5, 5.0])),
+    "both": read_only(np.radians([1.0, 2.0, 4.0, 6.0])),
 }
 """rad, m, rad."""
 

@@ -26,6 +26,9 @@ GATE = 13.8
 """Squared whitened distance of two ends; 1e-3 of true pairs lie beyond (chi-square, 2 degrees of freedom)."""
 MARGIN = 6.0
 """Twice the log likelihood by which a pair must beat every other of its lines: 20 to 1."""
+STRUCTURE_REACH_PX = 6.0
+"""px, sigma of a foretold place, 0.5 deg: further off, every other pair of structure lines is a wrong one: an
+image has hundreds of edges, and more than half of the cloud's have no partner among them."""
 SAME_LINE_PX = 2.0
 """px; an image line this near to the continuation of another is a piece of it and no rival."""
 SAME_LINE_SLOPE = 0.05
@@ -80,14 +83,18 @@ def associate(
     if len(rows) == 0:
         return Association((), NO_PAIRS)
     cost = np.full((len(cloud_lines), len(image_lines)), np.inf)
-    cost[rows[:, 0], rows[:, 1]] = _costs(candidates, camera, T_cam_lidar, covariance)
     unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
+    r = plk.residuals(candidates, camera.K, T_cam_lidar)
+    foretold = _foretold(candidates, camera, T_cam_lidar, covariance)
+    cost[rows[:, 0], rows[:, 1]] = _costs(r, candidates.covariance + foretold)
     # Of each image line only the best pair may win; the rest is asked of these few alone.
     best, second = (np.partition(np.vstack([cost, np.full(cost.shape[1], np.inf)]), 1, axis=0))[:2]
     ahead = (cost <= best) & np.isfinite(cost) & (cost + MARGIN <= second)
     chosen = np.array(
         [bool(ahead[i, j]) and _wins(cost, image_lines, (i, j), unit) for i, j in rows.tolist()]
     )
+    structure = np.array([cloud_lines[i].label == "structure" for i in rows[:, 0].tolist()])
+    chosen &= ~structure | (np.linalg.eigvalsh(foretold)[:, 1] <= (STRUCTURE_REACH_PX * unit) ** 2)
     matches = tuple(LineMatch(cloud_lines[i], image_lines[j]) for i, j in rows[chosen].tolist())
     return Association(matches, plk.select(candidates, chosen))
 
@@ -98,11 +105,14 @@ NO_PAIRS = plk.LinePairs(
 """The empty set of pairs."""
 
 
-def _costs(pairs: plk.LinePairs, camera: CameraModel, T_cam_lidar: Floats, covariance: Floats) -> Floats:
-    """Twice the negative log likelihood (N,) of each pair, up to a constant; inf beyond the gate."""
-    r = plk.residuals(pairs, camera.K, T_cam_lidar)
+def _foretold(pairs: plk.LinePairs, camera: CameraModel, T_cam_lidar: Floats, covariance: Floats) -> Floats:
+    """Covariance (N,2,2), px^2, of the distances for what is not known of the extrinsic."""
     J = plk.jacobians(pairs, camera.K, T_cam_lidar)
-    spread = pairs.covariance + J @ covariance @ J.transpose(0, 2, 1)
+    return np.asarray(J @ covariance @ J.transpose(0, 2, 1))
+
+
+def _costs(r: Floats, spread: Floats) -> Floats:
+    """Twice the negative log likelihood (N,) of each pair, up to a constant; inf beyond the gate."""
     distance = np.einsum("ni,ni->n", r, np.linalg.solve(spread, r[..., None])[..., 0])
     return np.where(distance <= GATE, distance + np.log(np.linalg.det(spread)), np.inf)
 

@@ -48,11 +48,8 @@ def _unmeasured(name: str) -> AbstractContextManager[None]:
 _LEAST_EDGES = 20
 """Edges below which a frame says nothing: three per axis."""
 
-_LINES_FRAMES = 3
-"""Frames with matched lines before lines may testify: a wrong match seldom repeats itself."""
-
-_LINES_MISFIT = 2.0
-"""Residual statistic per degree of freedom above which some pairs of lines are wrong, nobody knows which."""
+_LINES_FIT = 1e-3
+"""Chance of right pairs to fit each other no better; below it some are wrong, nobody knows which."""
 
 _LINES_REACH = 2.5
 """Sigmas of the prior of the matching: an answer beyond it comes from lines taken for each other."""
@@ -433,10 +430,10 @@ class Watch:
 
 
 def _testifies(lines: LineSolution) -> bool:
-    """Whether matched lines may be heard: often enough, fitting each other, within reach of the matching."""
+    """Whether matched lines may be heard: fitting each other, within reach of the matching."""
     estimate = lines.estimate
     within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
-    return within and estimate.frames >= _LINES_FRAMES and estimate.chi2 <= _LINES_MISFIT
+    return within and lines.fit >= _LINES_FIT
 
 
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:

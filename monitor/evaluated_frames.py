@@ -1,9 +1,10 @@
 """Single frames whose extrinsic is known: out of recordings, one by one, or simulated."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -119,6 +120,8 @@ def recorded_frames(
     most: int,
     reference_sigma: Floats,
     tell: Callable[[str], None] = lambda _: None,
+    *,
+    of_sets: Mapping[str, Floats] = MappingProxyType({}),
 ) -> EvaluatedFrames:
     """Frames of every recording in some folders, each with the extrinsic that the recording states.
 
@@ -127,15 +130,23 @@ def recorded_frames(
         most: Frames of each pair of each recording; those of a longer one are spread evenly over it.
         reference_sigma: float64 (6,), how well the recordings know their extrinsic, rad and m.
         tell: Told what of the recordings could not be used, one sentence each.
+        of_sets: The same for single sets, by name.
 
     Raises:
-        CalibwatchError: A place holds no recording, or a recording can not be used at all or does not state
-            its extrinsic; before any frame is given.
+        CalibwatchError: ``of_sets`` names a set that is not there, a place holds no recording, or a recording
+            can not be used at all or does not state its extrinsic; before any frame is given.
     """
     recordings = [found for place in places for found in _recordings(place)]
+    sets = list(dict.fromkeys(group for _, group in recordings))
+    for name in of_sets:
+        if name not in sets:
+            raise InputError(f"there is no set '{name}'", hint=f"there are: {', '.join(sets)}")
     listed = [_listed(location, group, most, tell) for location, group in recordings]
     count = sum(len(one.chosen) for one in listed)
-    return EvaluatedFrames(count, lambda: (frame for one in listed for frame in _read(one, reference_sigma)))
+    return EvaluatedFrames(
+        count,
+        lambda: (frame for one in listed for frame in _read(one, of_sets.get(one.group, reference_sigma))),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -251,6 +251,14 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
     show_default=True,
     help="How well the recordings know their own extrinsic, per axis.",
 )
+@click.option(
+    "--set-sigma",
+    "set_sigmas",
+    multiple=True,
+    type=(str, click.FloatRange(0.0, 180.0), click.FloatRange(0.0, 10.0)),
+    metavar="SET DEG M",
+    help="The same for one set where it is known better or worse; may be given again.",
+)
 def dataset_command(
     *,
     places: tuple[Path, ...],
@@ -261,6 +269,7 @@ def dataset_command(
     translation: float,
     prior_sigma: tuple[float, float] | None,
     reference_sigma: tuple[float, float],
+    set_sigmas: tuple[tuple[str, float, float], ...],
     seed: int,
     model: Path | None,
     as_json: bool,
@@ -278,7 +287,7 @@ def dataset_command(
     from monitor.first_guess import PriorSigma  # noqa: PLC0415 - likewise
     from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
 
-    chosen = _frames_of(places, simulated, frames, reference_sigma, seed)
+    chosen = _frames_of(places, simulated, frames, seed, reference_sigma, set_sigmas)
     folder = _made(out)
     segmenter = open_segmenter(model, 1)
     told = None if prior_sigma is None else PriorSigma(math.radians(prior_sigma[0]), prior_sigma[1])
@@ -321,7 +330,7 @@ def basin_command(
     from monitor.clock import SystemClock  # noqa: PLC0415 - likewise
     from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
 
-    chosen = _frames_of(places, simulated, frames, (0.0, 0.0), seed)
+    chosen = _frames_of(places, simulated, frames, seed)
     folder = _made(out)
     found = evaluate(chosen, starts, seed, open_segmenter(model, 1), SystemClock(), _progress)
     _clear()
@@ -331,7 +340,12 @@ def basin_command(
 
 
 def _frames_of(
-    places: tuple[Path, ...], simulated: int, most: int, reference_sigma: tuple[float, float], seed: int
+    places: tuple[Path, ...],
+    simulated: int,
+    most: int,
+    seed: int,
+    reference_sigma: tuple[float, float] = (0.0, 0.0),
+    set_sigmas: tuple[tuple[str, float, float], ...] = (),
 ) -> "EvaluatedFrames":
     """The frames of all places and simulated ones; none at all is wrong usage."""
     import numpy as np  # noqa: PLC0415 - not needed for --help
@@ -340,9 +354,13 @@ def _frames_of(
 
     if not places and not simulated:
         raise click.UsageError("nothing to calibrate: name a folder, or simulate some frames (--simulated N)")
-    sigma_deg, sigma_m = reference_sigma
-    sigma = np.array([np.radians(sigma_deg)] * 3 + [sigma_m] * 3)
-    parts = [recorded_frames(places, most, sigma, _warn)] if places else []
+    if set_sigmas and not places:
+        raise click.UsageError("--set-sigma speaks of a set of recordings: name their folder")
+    sigma, of_sets = (
+        {name: np.array([np.radians(deg)] * 3 + [m] * 3) for name, deg, m in known}
+        for known in ([("", *reference_sigma)], set_sigmas)
+    )
+    parts = [recorded_frames(places, most, sigma[""], _warn, of_sets=of_sets)] if places else []
     return chained([*parts, *([simulated_frames(simulated, seed)] if simulated else [])])
 
 

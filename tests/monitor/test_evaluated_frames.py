@@ -96,6 +96,16 @@ def test_parts_follow_each_other(tmp_path):
     assert len(both) == 2
 
 
+def test_a_set_may_be_known_better_or_worse_than_the_others(tmp_path):
+    for name in "ab":
+        write_frames(tmp_path / name)
+    places = [tmp_path / name for name in "ab"]
+    found = recorded_frames(places, 3, SIGMA, of_sets={"b": 7 * SIGMA})
+    assert [one.reference_sigma.tolist() for one in found] == [SIGMA.tolist(), (7 * SIGMA).tolist()]
+    with pytest.raises(CalibwatchError, match=r"no set 'c' \(there are: a, b\)"):
+        recorded_frames(places, 3, SIGMA, of_sets={"c": SIGMA})
+
+
 def refusal(*places):
     with pytest.raises(CalibwatchError) as refused:
         recorded_frames(places, 3, SIGMA)

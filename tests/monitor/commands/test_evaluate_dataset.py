@@ -156,6 +156,16 @@ def test_a_bad_folder_is_refused_in_one_line_and_nothing_is_written(calibwatch, 
     assert not out.exists()
 
 
+def test_a_set_that_is_not_there_has_no_sigma(calibwatch, tmp_path):
+    write_frames(tmp_path / "a")
+    code, out, err = calibwatch("evaluate", "dataset", tmp_path / "a", "--set-sigma", "b", 0.5, 0.1)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "no set 'b' (there are: a)" in err
+    code, _, err = calibwatch("evaluate", "dataset", "--simulated", 1, "--set-sigma", "b", 0.5, 0.1)
+    assert code == 2
+    assert "--set-sigma" in err
+
+
 @pytest.mark.parametrize("name", ["dataset", "basin"])
 def test_wrong_usage_and_a_folder_that_can_not_be_made(calibwatch, tmp_path, name):
     code, out, err = calibwatch("evaluate", name)

@@ -36,7 +36,8 @@ class CandidateParameters:
         most_edges: Looked at, of each finalist.
         same_rad: rad; with ``same_m`` how near two candidates are that will end at one place.
         same_m: m, of the camera's centre.
-        distinct_rad: rad; with ``distinct_m`` what makes a finalist a different answer.
+        distinct_rad: rad; with ``distinct_m`` what makes a finalist a different answer: nearer ones are told
+            apart by whoever refines the first.
         distinct_m: m, of the camera's centre.
         baseline_m: m; LiDAR and camera sit on one vehicle.
         edges: What counts as an edge.
@@ -55,8 +56,8 @@ class CandidateParameters:
     most_edges: int = 1500
     same_rad: float = math.radians(0.5)
     same_m: float = 0.2
-    distinct_rad: float = math.radians(1.0)
-    distinct_m: float = 0.3
+    distinct_rad: float = math.radians(2.0)
+    distinct_m: float = 0.5
     baseline_m: float = 5.0
     edges: EdgeParameters = field(default_factory=EdgeParameters)
     witness: EdgeWitnessParameters = field(default_factory=EdgeWitnessParameters)

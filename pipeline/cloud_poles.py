@@ -51,6 +51,9 @@ _MAX_POLE_CELLS = 2
 """Cells across: a pole on a corner of the grid fills 2 x 2."""
 _TOP_SLACK_M = 0.3
 """m; FORMULAS B: the highest beam may pass just above a return."""
+_SLIM_SHARE, _SLIM_FACTOR, _SLIM_M = 0.25, 2.0, 0.06
+"""Levels as wide as this many times a slim one, the quarter that is slimmest, are the pole; and levels of so
+many m, rms, always: range noise and the beam's width."""
 MAX_RADIUS_M = 0.3
 """m; thicker than any street pole: a limit to the shift from the front surface to the axis."""
 MIN_SLOPE_REACH_M = 2.0
@@ -74,16 +77,17 @@ def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> li
         Lines from foot to top, in no particular order.
     """
     basis = plane_basis(ground.normal).astype(np.float32)
-    height = cloud.xyz @ ground.normal.astype(np.float32) + np.float32(ground.offset)
-    index = unrepeated(cloud.xyz, np.flatnonzero(seen & (height > BOTTOM_M) & (height < CEILING_M)))
+    index = unrepeated(cloud.xyz, np.flatnonzero(seen))
+    height = ground.local_heights(cloud.xyz[index])
+    tall = (height > BOTTOM_M) & (height < CEILING_M)
+    index, height = index[tall], height[tall]
     plan = (cloud.xyz[index] @ basis.T).astype(np.float64)
     near = np.hypot(plan[:, 0], plan[:, 1]) < POLE_RANGE_M
-    index, plan = index[near], plan[near]
+    index, plan, height = index[near], plan[near], height[near]
     if len(index) < MIN_POLE_POINTS:
         return []
-    returns = _Returns(
-        index, cloud.xyz[index].astype(np.float64), plan, np.asarray(height[index], dtype=np.float64)
-    )
+    xyz = cloud.xyz[index].astype(np.float64)
+    returns = _Returns(index, xyz, plan, height, ground.heights(xyz) - height)
     candidates = _pole_candidates(returns, ground.offset, _top_slope(cloud, ground, basis))
     poles = []
     for members in sorted(candidates, key=len, reverse=True)[:MOST_CANDIDATES]:
@@ -95,12 +99,16 @@ def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> li
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Returns:
-    """Points above ground: index in the cloud, (M,3), (M,2) in the plan, height above ground (M,)."""
+    """Points above ground: index in the cloud, (M,3), (M,2) in the plan, height above the ground below (M,).
+
+    ``rise`` (M,) is the height of that ground above the main plane.
+    """
 
     index: Indices
     xyz: Floats
     plan: Floats
     up: Floats
+    rise: Floats
 
 
 def _top_slope(cloud: PointCloud, ground: Ground, basis: np.ndarray) -> float:
@@ -125,8 +133,10 @@ def _pole_candidates(returns: _Returns, sensor_height: float, top_slope: float) 
     lowest = np.full(shape[0] * shape[1], np.inf)
     np.maximum.at(highest, cell, up)
     np.minimum.at(lowest, cell, up)
+    rise = np.zeros(shape[0] * shape[1])
+    rise[cell] = returns.rise
     reach = np.hypot(*(low[:, None] + CELL_M * (np.indices(shape)[::-1].reshape(2, -1) + 0.5)))
-    top = np.minimum(TOP_M, sensor_height + reach * top_slope - _TOP_SLACK_M)
+    top = np.minimum(TOP_M, sensor_height - rise + reach * top_slope - _TOP_SLACK_M)
     tall = (highest - lowest >= MIN_EXTENT_M) & (highest > top)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         tall.reshape(shape).astype(np.uint8), connectivity=8
@@ -149,15 +159,28 @@ def _pole(returns: _Returns, ground: Ground, members: Indices) -> CloudLine | No
     centre = np.median(returns.plan[members], axis=0)
     # The cells hold neighbours and may cut the pole; the square around the median holds its ring as well.
     near = np.flatnonzero(np.abs(returns.plan - centre).max(axis=1) < RING_M[1])
+    inside = np.hypot(*(returns.plan[near] - centre).T) < AXIS_M
+    # A plate or a lamp is wider than its pole and stands beside it: it would bend the axis.
+    slim = inside.copy()
+    slim[inside] = _slim_levels(returns.plan[near[inside]], returns.up[near[inside]])
+    for shaft in (slim, inside):
+        axis = _axis(returns, ground, near, shaft)
+        if axis is not None:
+            return axis
+    return None
+
+
+def _axis(returns: _Returns, ground: Ground, near: Indices, shaft: NDArray[np.bool_]) -> CloudLine | None:
+    """The axis of those of the returns nearby (M,) that may be a shaft, or None where they are no pole."""
     xyz, up = returns.xyz[near], returns.up[near]
-    pole = np.hypot(*(returns.plan[near] - centre).T) < AXIS_M
+    pole = shaft
     axis, beyond = None, np.zeros(len(near))
     for _ in range(_POLE_REFITS):
         if pole.sum() < MIN_POLE_POINTS:
             return None
         axis = total_least_squares(xyz[pole])
         beyond = np.linalg.norm(_across(xyz, axis), axis=1)
-        pole = beyond < min(AXIS_M, max(3.0 * axis.sigma, _LEVEL_M / 2))
+        pole = shaft & (beyond < min(AXIS_M, max(3.0 * axis.sigma, _LEVEL_M / 2)))
     if axis is None or pole.sum() < MIN_POLE_POINTS:
         return None
     axis = total_least_squares(xyz[pole])
@@ -174,6 +197,18 @@ def _pole(returns: _Returns, ground: Ground, members: Indices) -> CloudLine | No
         return None
     moved = _behind_the_front(axis, _across(xyz[pole], axis), ground)
     return cloud_line("pole", moved, returns.index[near[pole]])
+
+
+def _slim_levels(plan: Floats, up: Floats) -> NDArray[np.bool_]:
+    """Whether points (M,2) of the plan at heights (M,) are of levels as slim as the slimmest of the thing."""
+    if len(up) == 0:
+        return np.zeros(0, dtype=bool)
+    _, level = np.unique(np.floor(up / _LEVEL_M), return_inverse=True)
+    count = np.bincount(level)
+    mean = np.column_stack([np.bincount(level, weights=x) / count for x in plan.T])
+    spread = np.sqrt(np.bincount(level, weights=((plan - mean[level]) ** 2).sum(axis=1)) / count)
+    usual = float(np.quantile(spread, _SLIM_SHARE))
+    return np.asarray((spread <= max(_SLIM_FACTOR * usual, _SLIM_M))[level])
 
 
 def _across(xyz: Floats, axis: FittedAxis) -> Floats:

@@ -102,3 +102,31 @@ def test_upright_things_that_are_no_poles(thing):
     }
     xyz = np.concatenate([cloud.xyz, shapes[thing].astype(np.float32)])
     assert found(PointCloud(xyz), rng) == []
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.12])
+def test_a_plate_does_not_bend_the_axis_of_its_pole(aside):
+    rng = np.random.default_rng(11)
+    x, y = 9.0, 4.0
+    cloud = scenes.sampled_cloud(rng, poles=[(x, y)], lanes=[], radius=0.04, noise=0.01)
+    grid = np.meshgrid(np.arange(y - 0.3, y + 0.3, 0.03) + aside, np.arange(0.32, 1.0, 0.06))
+    across, up = (axis.ravel() for axis in grid)
+    plate = np.column_stack([np.full(across.size, x - 0.06), across, up]).astype(np.float32)
+    # The pole ends at the plate, 2.5 m above ground.
+    below = cloud.xyz[:, 2] < 1.0
+    (pole,) = found(PointCloud(np.concatenate([cloud.xyz[below], plate])), rng)
+    assert off_axis(pole, *scenes.pole_ends([(x, y)])[0]) < 0.06
+    way = (pole.end - pole.start) / np.linalg.norm(pole.end - pole.start)
+    assert np.degrees(np.arccos(way[2])) < 1.5
+
+
+@pytest.mark.parametrize("slope", [0.04, -0.04])
+def test_poles_beyond_the_break_of_a_slope_are_found_at_their_height(slope):
+    rng = np.random.default_rng(12)
+    cloud = scenes.sampled_cloud(rng, lanes=[], poles=[(24.0, 5.0)], noise=0.01)
+    rise = (slope * np.maximum(cloud.xyz[:, 0] - 10.0, 0.0)).astype(np.float32)
+    xyz = cloud.xyz + rise[:, None] * np.array([0, 0, 1], np.float32)
+    (pole,) = found(PointCloud(xyz), rng)
+    foot = -scenes.HEIGHT + slope * 14.0
+    # H0 above the ground of its place, less than one beam's gap higher.
+    assert 0.7 < pole.start[2] - foot < 1.0

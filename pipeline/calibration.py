@@ -17,7 +17,7 @@ from pipeline import se3
 from pipeline.edge_witness import EdgeBatch, EdgeFrame, batch_of
 from pipeline.edges import Edges, find_edges
 from pipeline.ego import Ego
-from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, balanced, find_tops, weighed
+from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, evened, find_tops, weighed
 from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
 from pipeline.observability import MAX_SIGMA, Observability, observable
@@ -48,7 +48,7 @@ class CalibrationParameters:
     most_frames: int = 20
     least_edges: int = 60
     least_contrast: float = 0.15
-    least_peak: float = 4.2
+    least_peak: float = 4.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,13 +229,11 @@ class Calibrator:
         T_guess, modes, prior = self.mount.T_cam_lidar, self._settings.modes, self._settings.prior
         rng = np.random.default_rng(self._parameters.seed)
         with stage("search"):
-            batch = balanced(self._batch(self._kept), T_guess, modes, rng)
-            tops = find_tops(batch, T_guess, prior, modes, rng)
+            tops = find_tops(self._batch(self._kept), T_guess, prior, modes, rng)
         with stage("refinement"):
             # The edges in view, and which stand for what part of it, are those of the best fit.
-            T_best = se3.retract(T_guess, tops[0][0])
-            batch = balanced(self._batch(self._picked_again(T_best)), T_best, modes, rng)
-            found = weighed(batch, T_guess, tops, prior, modes, rng)
+            there = self._picked_again(se3.retract(T_guess, tops[0][0]))
+            found = weighed(self._batch(there), T_guess, tops, prior, modes, rng)
         return self._result(found)
 
     def _picked_again(self, T_cam_lidar: Floats) -> list[_Kept]:
@@ -249,11 +247,12 @@ class Calibrator:
         return there
 
     def _batch(self, frames: Sequence[_Kept]) -> EdgeBatch:
-        return batch_of(
+        joined = batch_of(
             [EdgeFrame(kept.stamp_ns, kept.edges, kept.gradients, kept.distance_m) for kept in frames],
             self.mount.camera,
             self._parameters.edge_witness.most_edges,
         )
+        return evened(joined)
 
     def _result(self, found: EdgeModes) -> Calibrated:
         """Estimate, errors and words from the modes."""

@@ -53,8 +53,9 @@ class ModeParameters:
         draws: Turns at which the coarsest level is looked at; a power of two.
         climbed: The best of them that are climbed from.
         spread: Alert units between places that are climbed from: the coarsest level's blur.
-        hops_rad: Turns from the best maximum along its valleys, rad.
-        hop_ranges_m: Distances that stay where they are in such a turn, m: what is near, and what is far.
+        valley_turns: Steps each way of the turns that are looked at beside the best maximum.
+        valley_shifts: Steps each way of the shifts that are looked at with each of them.
+        valley_climbed: The best of these places, of each of the two planes, that are climbed from.
         refined: Maxima that are refined on all edges.
         apart: Alert units; maxima nearer to each other are one.
         searched: So many edges, evenly picked, lead to the maxima; all of them decide.
@@ -69,8 +70,9 @@ class ModeParameters:
     draws: int = 256
     climbed: int = 10
     spread: float = 4.0
-    hops_rad: tuple[float, ...] = (math.radians(0.5), math.radians(1.2))
-    hop_ranges_m: tuple[float, ...] = (9.0, 20.0)
+    valley_turns: int = 7
+    valley_shifts: int = 3
+    valley_climbed: int = 4
     refined: int = 6
     apart: float = 1.0
     searched: int = 500
@@ -98,35 +100,15 @@ class EdgeModes:
     peak: float
 
 
-def balanced(
-    batch: EdgeBatch, T_cam_lidar: Floats, parameters: ModeParameters, rng: np.random.Generator
-) -> EdgeBatch:
-    """The same edges, each kind with the weight by which it tells a fit from chance.
+def evened(batch: EdgeBatch) -> EdgeBatch:
+    """The same edges, each weighing by the root of how few of its kind share its cell of the image.
 
-    Upright edges are many, but slide along what is upright in the image: under them a wrong pitch fits as
-    well as the right one, or better. The mean response of a kind scatters by chance, from place to place,
-    with a variance that says how many independent edges the kind is worth; its inverse is the kind's weight
-    (of independent means with a common signal that sum is the best one).
-
-    Args:
-        batch: Edges and gradients.
-        T_cam_lidar: float64 (4,4), around which chance is asked.
-        parameters: See there.
-        rng: Draws places.
+    One object is one witness, not as many as the sensor has rings on it (PROBE 6). Upright edges are many,
+    but slide along what is upright in the image: under them alone a wrong pitch fits as well as the right.
     """
-    plain = dataclasses.replace(batch, weight=np.ones(len(batch)))
-    places = edge_witness.far_extrinsics(T_cam_lidar, parameters.edge_witness, rng)
-    responses = np.stack([edge_witness.score_only(plain, T, 0) for T in places])
-    weight = np.zeros(len(batch))
-    for kind in range(len(KIND_NAMES)):
-        of_kind = batch.kind == kind
-        count = int(of_kind.sum())
-        if count == 0:
-            continue
-        seen = responses[:, of_kind]
-        # A mean of n can not scatter less than n independent ones do; a few places may not show it.
-        variance = max(float(np.var(seen.mean(axis=1))), float(np.var(seen, axis=1).mean()) / count, 1e-12)
-        weight[of_kind] = 1.0 / (variance * count)
+    group = batch.cell * len(KIND_NAMES) + batch.kind
+    _, index, count = np.unique(group, return_inverse=True, return_counts=True)
+    weight = count[index] ** -0.5
     return dataclasses.replace(batch, weight=weight / weight.mean())
 
 
@@ -186,8 +168,8 @@ def find_tops(
     tops: list[Top] = []
     _climb(thin, T_guess, climbs, tops, prior, parameters)
     best = max(tops, key=lambda top: top[1], default=(guess, 0.0))[0]
-    hops = [(best + hop, (0,)) for hop in _hops(parameters)]
-    _climb(thin, T_guess, hops, tops, prior, parameters)
+    elsewhere = _along_valleys(thin, T_guess, best, prior, parameters)
+    _climb(thin, T_guess, [(place, (1, 0)) for place in elsewhere], tops, prior, parameters)
     tops.sort(key=lambda top: -top[1])
     # A first guess within whose reach no maximum lies stands for itself.
     return _refined(batch, T_guess, tops[: parameters.refined] or [(guess, 0.0)], parameters)
@@ -215,26 +197,39 @@ def _promising(
     places[:, :3] = (2.0 * drawn - 1.0) * widest
     level = len(thin.stacks) - 1
     heights = [edge_witness.score_only(thin, se3.retract(T_guess, xi), level).sum() for xi in places]
+    return _apart(places, heights, parameters.climbed, parameters.spread, [])
+
+
+def _along_valleys(
+    thin: EdgeBatch, T_guess: Floats, best: Floats, prior: Prior, parameters: ModeParameters
+) -> list[Floats]:
+    """The best places beside a maximum that differ by a turn up or aside and the shift that looks like it.
+
+    In these two planes an extrinsic is least sure (PROBE 3), and false fits lie in them (PROBE 6).
+    """
+    turns = np.arange(-1.0, 1.0 + 1e-9, 1.0 / parameters.valley_turns) * parameters.reach * prior.sigma_rad
+    shifts = np.arange(-1.0, 1.0 + 1e-9, 1.0 / parameters.valley_shifts) * parameters.reach * prior.sigma_m
     picked: list[Floats] = []
-    for index in np.argsort(heights)[::-1]:
-        if len(picked) == parameters.climbed:
-            break
-        if all(np.linalg.norm((places[index] - other) / UNITS) > parameters.spread for other in picked):
-            picked.append(places[index])
+    for turn_axis, shift_axis in ((0, 4), (1, 3)):
+        places = np.tile(best, (len(turns) * len(shifts), 1))
+        places[:, turn_axis] += np.repeat(turns, len(shifts))
+        places[:, shift_axis] += np.tile(shifts, len(turns))
+        heights = [edge_witness.score_only(thin, se3.retract(T_guess, xi), 1).sum() for xi in places]
+        picked += _apart(places, heights, parameters.valley_climbed, parameters.spread, [best])
     return picked
 
 
-def _hops(parameters: ModeParameters) -> list[Floats]:
-    """Turns up or aside, with the shift that leaves what stands at some distance where it is, camera axes."""
-    hops = []
-    for turn in parameters.hops_rad:
-        for distance in (*parameters.hop_ranges_m, math.inf):
-            shift = 0.0 if math.isinf(distance) else turn * distance
-            for sign in (-1.0, 1.0):
-                # phi_x moves a point at depth z by -z phi_x along y; phi_y by +z phi_y along x (A2).
-                hops.append(sign * np.array([turn, 0.0, 0.0, 0.0, shift, 0.0]))
-                hops.append(sign * np.array([0.0, turn, 0.0, -shift, 0.0, 0.0]))
-    return hops
+def _apart(
+    places: Floats, heights: Sequence[float], most: int, spread: float, known: Sequence[Floats]
+) -> list[Floats]:
+    """The highest of the places that lie apart from each other and from known ones, at most so many."""
+    picked: list[Floats] = []
+    for index in np.argsort(heights)[::-1]:
+        if len(picked) == most:
+            break
+        if all(np.linalg.norm((places[index] - other) / UNITS) > spread for other in (*known, *picked)):
+            picked.append(places[index])
+    return picked
 
 
 def _climb(

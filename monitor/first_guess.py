@@ -22,11 +22,11 @@ from pipeline.parameters import Parameters
 from pipeline.records import CameraModel, Floats, FramePair, Masks
 from pipeline.segmentation import Segmenter, grid_scale
 
-MOST_FRAMES = 6
+MOST_FRAMES = 10
 """Frames of a drive that are tried before the search is given up: some 2 s each."""
 
-SPACING_NS = 2_000_000_000
-"""ns between them: 20 m further on in town other things are in view."""
+SPACING_NS = 500_000_000
+"""ns between them: 5 m further on in town other lines are whole and other edges in view."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ def main() -> None:
     results, docs = Path(sys.argv[1]), Path(sys.argv[2])
     page = docs / "crlf.md"
     text = re.sub(
-        r"(<!-- (\w+) -->\n).*?(?=<!-- end -->)",
+        r"(<!-- (?!end)(\w+) -->\n).*?(?=<!-- end -->)",
         lambda block: block[1] + _block(results / block[2], docs, block[0].removeprefix(block[1])),
         page.read_text(encoding="utf-8"),
         flags=re.DOTALL,

@@ -55,15 +55,12 @@ def find_structure_lines(
     shift = np.zeros(3) if origin is None else origin
     with np.errstate(invalid="ignore"):
         sound = (np.abs(cloud.xyz) < OUTERMOST_M).all(axis=1)
-    if not sound.all():
-        index = np.flatnonzero(sound)
-        ring = None if cloud.ring is None else cloud.ring[index]
-        found = find_structure_lines(PointCloud(cloud.xyz[index], None, ring), seen[index], rng, origin)
-        return [dataclasses.replace(line, points=index[line.points]) for line in found]
+    index = unrepeated(cloud.xyz, np.flatnonzero(seen & sound))
+    # Nothing is asked of what is out of view: most of a sweep.
+    cloud = PointCloud(cloud.xyz[index], None, None if cloud.ring is None else cloud.ring[index])
     xyz = cloud.xyz.astype(np.float64) - shift
-    chosen = unrepeated(cloud.xyz, np.flatnonzero(seen))
-    keep = np.zeros(len(xyz), dtype=bool)
-    keep[chosen[:: max(1, math.ceil(len(chosen) / MOST_POINTS))]] = True
+    keep = np.zeros(len(index), dtype=bool)
+    keep[:: max(1, math.ceil(len(index) / MOST_POINTS))] = True
     turn, pattern = _pattern(cloud, xyz, keep)
     spacing = DEFAULT_SPACING_RAD if pattern is None else max(pattern.ring_spacing, pattern.azimuth_step)
     cells = thinned(xyz, keep, spacing)
@@ -76,7 +73,10 @@ def find_structure_lines(
         # With rings the same borders are known better from their jumps.
         lines += borders(planes, cells, xyz, spacing, rng)
     best = distinct(joined([line for line in lines if _sure(line)]))[:MOST_LINES]
-    return [dataclasses.replace(line, start=line.start + shift, end=line.end + shift) for line in best]
+    return [
+        dataclasses.replace(line, start=line.start + shift, end=line.end + shift, points=index[line.points])
+        for line in best
+    ]
 
 
 def cloud_lines(lines: Sequence[UncertainLine]) -> list[CloudLine]:

@@ -118,7 +118,7 @@ def png(panels: Sequence[Panel], legend: Sequence[str], columns: int) -> bytes:
     for i, row in enumerate(rows):
         for j, panel in enumerate(row):
             _draw(canvas[i * height : (i + 1) * height, j * width : (j + 1) * width], panel, legend)
-    _, data = cv2.imencode(".png", canvas)
+    _, data = cv2.imencode(".png", canvas, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return data.tobytes()
 
 

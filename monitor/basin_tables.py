@@ -64,7 +64,7 @@ def basin_picture(found: Basin) -> bytes:
     for sweep, curve in found.sweeps.items():
         last = curve.ways["calibrate"][-1].offset
         step = {"rotation": 10.0, "translation": 1.0, "both": 1.0}[sweep]
-        x = steps(0.0, last, step, _OFFSETS[sweep])
+        x = steps(0.0, step * math.ceil(last / step - 1e-9), step, _OFFSETS[sweep])
         shares = steps(0.0, 1.05, 0.2, f"share within {_wanted(sweep)}")
         above.append(Panel(_TITLES[sweep], x, shares, _curves(curve, lambda p: p.success)))
         if sweep == "translation":

@@ -213,11 +213,14 @@ def _axes_panel(found: Dataset, title: str, unit: str, names: Sequence[AxisName]
 
 def _cumulative(title: str, unit: str, series: Sequence[Sequence[float]]) -> Panel:
     """Share of the errors below each value."""
-    x = decades([value for values in series for value in values], f"error, {unit}")
+    least = _LEAST[unit]
+    x = decades([least, *(max(value, least) for values in series for value in values)], f"error, {unit}")
     curves = tuple(_share_below(index, values, x) for index, values in enumerate(series) if values)
     return Panel(title, x, steps(0.0, 1.05, 0.2, "share below"), curves)
 
 
+_LEAST = {"deg": 0.01, "m": 0.001}
+"""Where curves begin: a tenth of what one frame can tell."""
 _POINTS = 40
 """Of one curve: beyond, marks run into each other."""
 

@@ -291,9 +291,11 @@ def _groups(frames: Sequence[LineFrame], found: Sequence[Association]) -> NDArra
 
 
 def _consistent(round_: _Round, camera: CameraModel, T: Floats, prior: plk.Prior) -> _Round | None:
-    """The round without groups that the others contradict, solved."""
+    """The round without groups that the others contradict, solved from ``T``; None if none is left."""
     while True:
-        solution = plk.method_one(round_.pairs, camera.K, T, prior=prior)
+        # The prior says where to start; method II asks for none and costs as much again.
+        solution = plk.method_one(round_.pairs, camera.K, T, prior=prior, start_two=False)
+        T = solution.T_cam_lidar
         solved = _Round(round_.found, round_.pairs, round_.group, solution)
         groups, belief = _linearised(solved, camera, prior)
         odds = line_doubt.odds_wrong(groups, solved.labels, belief)

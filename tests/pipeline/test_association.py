@@ -137,3 +137,58 @@ def test_covariance_of_the_end_distances_is_that_of_repeated_fits(monkeypatch):
         stated.append(pair.covariance[0])
     measured = np.cov(np.array(residuals).T)
     np.testing.assert_allclose(np.mean(stated, axis=0), measured, rtol=0.1, atol=0.08)
+
+
+def test_a_neighbouring_lane_is_not_taken_for_one_that_the_image_does_not_show():
+    rng = np.random.default_rng(9)
+    cloud, _ = scenes.line_sets(rng, lanes=[(1.8, 6.5)], poles=[])
+    _, image = scenes.line_sets(rng, lanes=[(5.4, 6.5), (-1.8, 6.5)], poles=[])
+    assert associate(cloud, image, scenes.CAMERA, scenes.TRUTH, PRIOR).matches == ()
+
+
+def test_the_lines_of_a_double_line_are_dropped_until_the_belief_tells_them_apart():
+    rng = np.random.default_rng(10)
+    cloud, image = scenes.line_sets(
+        rng, lanes=[(1.8, 6.5), (2.05, 6.5)], poles=[], sigma_px=0.3, sigma_m=0.01
+    )
+    assert associate(cloud, image, scenes.CAMERA, scenes.TRUTH, PRIOR).matches == ()
+    sure = associate(cloud, image, scenes.CAMERA, scenes.TRUTH, TIGHT / 9)
+    assert sorted(indices(sure, cloud, image)) == [(0, 0), (1, 1)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_accepted_lanes_keep_their_order_from_left_to_right(seed):
+    rng = np.random.default_rng(seed)
+    lanes = [(y, 6.5) for y in np.sort(rng.uniform(-9, 9, 7))]
+    cloud, image = scenes.line_sets(rng, lanes=lanes, poles=[])
+    believed = se3.retract(scenes.TRUTH, rng.multivariate_normal(np.zeros(6), PRIOR))
+    kept = [k for k in range(7) if rng.random() < 0.7]
+    pairs = indices(
+        associate(cloud, [image[k] for k in kept], scenes.CAMERA, believed, PRIOR),
+        cloud,
+        [image[k] for k in kept],
+    )
+    order = [kept[j] for _, j in sorted(pairs)]
+    assert order == sorted(order)
+
+
+def test_a_line_found_twice_in_the_cloud_pairs_no_more_than_once():
+    rng = np.random.default_rng(11)
+    cloud, image = scenes.line_sets(rng, lanes=[(1.8, 6.5)], poles=[])
+    assert len(associate([*cloud, *cloud], image, scenes.CAMERA, scenes.TRUTH, TIGHT).matches) <= 1
+
+
+def structure(line):
+    if isinstance(line, CloudLine):
+        return CloudLine(
+            "structure", line.start, line.end, line.points, line.sigma_m, line.spread, line.mean_m
+        )
+    return ImageLine("structure", line.start, line.end, line.sigma_px)
+
+
+def test_structure_waits_for_a_belief_that_tells_edges_apart():
+    rng = np.random.default_rng(12)
+    cloud, image = scenes.line_sets(rng, lanes=[])
+    cloud, image = [structure(line) for line in cloud], [structure(line) for line in image]
+    assert associate(cloud, image, scenes.CAMERA, scenes.TRUTH, PRIOR).matches == ()
+    assert len(associate(cloud, image, scenes.CAMERA, scenes.TRUTH, TIGHT).matches) == 4

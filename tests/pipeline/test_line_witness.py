@@ -1,3 +1,4 @@
+import dataclasses
 import importlib.util
 import json
 import math
@@ -7,10 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.special import chdtrc
 
-from pipeline import se3
+from pipeline import labels, se3
 from pipeline.line_witness import (
     FRAME_CORRELATION,
+    PRIOR_SIGMA,
     LineFrame,
     effective_frames,
     find_lines,
@@ -19,6 +22,9 @@ from pipeline.line_witness import (
 )
 from pipeline.observability import in_vehicle_axes, observable
 from pipeline.records import CameraImage, CameraModel, Masks, PointCloud
+from pipeline.simulation.drive import Drive, DriveParameters, Motion
+from pipeline.simulation.lidar import spinning
+from pipeline.simulation.scene import SceneParameters
 
 _spec = importlib.util.spec_from_file_location(
     "line_scenes", Path(__file__).parents[1] / "oracles" / "line_scenes.py"
@@ -28,6 +34,8 @@ _spec.loader.exec_module(scenes)
 
 LIMITS = np.array([*np.radians([0.75, 0.5, 0.5]), 0.20, 0.15, 0.15])
 R_VC = se3.AXES_CAM_IN_VEHICLE
+WIDE = np.array([*np.radians([2.0] * 3), *[0.3] * 3]) / np.sqrt(3.0)
+"""Sigma of a start that is anywhere within 2 deg and 0.3 m per axis."""
 ASIDE = np.cross(scenes.UP, scenes.FORWARD)
 
 
@@ -165,6 +173,140 @@ def test_effective_frames_is_the_variance_ratio_of_an_ar1_mean():
     assert effective_frames(n) == pytest.approx(1.0 / ((phi**lags).sum() / n**2))
     assert effective_frames(1) == 1.0
     assert effective_frames(1000) == pytest.approx(1000 * (1 - phi) / (1 + phi), rel=0.01)
+
+
+def moved(line, left):
+    """A cloud line of something that stands or lies beside, m to the left."""
+    off = np.array([0.0, left, 0.0])
+    return dataclasses.replace(line, start=line.start + off, end=line.end + off)
+
+
+def with_trunks(rng, share):
+    """A frame in which some cloud lines are of something else."""
+    cloud, image = scenes.line_sets(rng)
+    cloud = [
+        moved(line, rng.choice([-1, 1]) * rng.uniform(0.2, 0.8)) if rng.random() < share else line
+        for line in cloud
+    ]
+    return LineFrame(tuple(cloud), tuple(image), (), ASIDE)
+
+
+def test_a_trunk_beside_a_pole_is_left_out():
+    rng = np.random.default_rng(15)
+    taken = kept = 0
+    for _ in range(40):
+        cloud, image = scenes.line_sets(rng)
+        trunk = int(rng.integers(4, 8))
+        cloud[trunk] = moved(cloud[trunk], 0.5)
+        solution = solve_lines(
+            [LineFrame(tuple(cloud), tuple(image), (), ASIDE)], scenes.CAMERA, scenes.TRUTH
+        )
+        taken += any(match.cloud is cloud[trunk] for match in solution.matches[0])
+        kept += len(solution.matches[0])
+        drift, seen = in_axes(solution.estimate)
+        assert (np.abs(drift) < 4 * seen.axis_sigmas).all()
+    assert taken <= 2
+    assert kept >= 40 * 5
+
+
+def test_sigma_is_honest_though_one_pair_in_seven_is_wrong():
+    rng = np.random.default_rng(16)
+    scores, chances = [], []
+    for _ in range(60):
+        one = with_trunks(rng, 0.15)
+        injected = np.concatenate([np.radians(rng.uniform(-2, 2, 3)), rng.uniform(-0.3, 0.3, 3)])
+        stored = se3.stored_before(scenes.TRUTH, injected, None)
+        solution = solve_lines([one], scenes.CAMERA, stored, WIDE)
+        drift, seen = in_axes(solution.estimate)
+        V = seen.directions[:, seen.observed]
+        z = V.T @ ((drift - injected) / LIMITS) / seen.sigmas[seen.observed]
+        scores.append(z)
+        chances.append(chdtrc(max(len(z), 1), float(z @ z)))
+    flat = np.concatenate(scores)
+    assert len(flat) > 120
+    assert np.mean(np.abs(flat) < 1) > 0.6
+    assert np.mean(np.abs(flat) < 2) > 0.9
+    # Two or three of eight that are wrong alike now and then outvote the others.
+    assert np.mean(np.abs(flat) > 4) < 0.02
+    assert np.mean(np.array(chances) < 1e-4) < 0.05
+
+
+def test_the_same_wrong_pole_in_every_frame_does_not_vouch_for_itself():
+    """A pole 0.4 m beside the one that the image shows, ten frames long, and nothing else."""
+    rng = np.random.default_rng(17)
+    frames = []
+    for step in range(10):
+        cloud, image = scenes.line_sets(rng, lanes=[], poles=[(30.0 - 2 * step, 5.0)])
+        shifted = tuple(moved(line, 0.4) for line in cloud)
+        frames.append(LineFrame(shifted, tuple(image), (), ASIDE))
+    solution = solve_lines(frames, scenes.CAMERA, scenes.TRUTH)
+    drift, seen = in_axes(solution.estimate)
+    assert not seen.axis_observed[[2, 4]].any() or (np.abs(drift) < 3 * seen.axis_sigmas).all()
+
+
+def test_a_wider_prior_holds_what_a_narrow_one_sees():
+    rng = np.random.default_rng(18)
+    one = frame(rng, poles=[(15.0, 5.0), (15.0, 6.5), (25.0, -6.0)])
+    narrow = solve_lines([one], scenes.CAMERA, scenes.TRUTH, PRIOR_SIGMA / 2).estimate
+    wide = solve_lines([one], scenes.CAMERA, scenes.TRUTH, 4 * PRIOR_SIGMA).estimate
+    assert narrow.features == 7
+    assert wide.features < narrow.features
+    assert np.linalg.eigvalsh(narrow.information - wide.information).min() > -1e-6 * np.trace(
+        narrow.information
+    )
+
+
+def test_fit_tells_pairs_that_no_noise_explains():
+    rng = np.random.default_rng(19)
+    good, bad = [], []
+    for _ in range(15):
+        good.append(solve_lines([frame(rng)], scenes.CAMERA, scenes.TRUTH).fit)
+        cloud, image = scenes.line_sets(rng, sigma_px=4.0)
+        claimed = tuple(dataclasses.replace(line, sigma_px=0.8) for line in image)
+        rough = LineFrame(tuple(cloud), claimed, (), ASIDE)
+        bad.append(solve_lines([rough], scenes.CAMERA, scenes.TRUTH, PRIOR_SIGMA / 2).fit)
+    assert min(good) > 1e-3
+    assert np.median(bad) < 0.1 < np.median(good)
+    assert solve_lines([], scenes.CAMERA, scenes.TRUTH).fit == 1.0
+
+
+@pytest.mark.slow
+def test_single_frames_of_simulated_streets_are_honest():
+    """From points and pixels, start within 2 deg and 0.3 m per axis, masks as the scene is."""
+    rng = np.random.default_rng(20)
+    scores, answers = [], 0
+    for seed in range(16):
+        parameters = DriveParameters(
+            seed=seed,
+            duration=0.15,
+            scene=SceneParameters(length=140.0, curvature=float(rng.uniform(0, 0.004))),
+            motion=Motion(speed=0.01, swing=0.0, weave=0.0, bob=0.0),
+            lidar=spinning(int(rng.choice([32, 64, 128]))),
+        )
+        shot = Drive(parameters).frame(0)
+        painted, pole = shot.labels == labels.LANE, shot.labels == labels.POLE
+        masks = Masks(painted, pole, painted.astype(np.float32), pole.astype(np.float32), 1.0, 1.0)
+        injected = np.concatenate([np.radians(rng.uniform(-2, 2, 3)), rng.uniform(-0.3, 0.3, 3)])
+        stored = se3.stored_before(shot.T_cam_lidar, injected, None)
+        found = find_lines(
+            shot.cloud,
+            shot.image,
+            masks,
+            parameters.camera,
+            stored,
+            up=parameters.T_vehicle_lidar[2, :3],
+            forward=parameters.T_vehicle_lidar[0, :3],
+            rng=rng,
+        )
+        drift, seen = in_axes(solve_lines([found], parameters.camera, stored, WIDE).estimate)
+        answers += bool(seen.observed.any())
+        V = seen.directions[:, seen.observed]
+        scores.append(V.T @ ((drift - injected) / LIMITS) / seen.sigmas[seen.observed])
+    flat = np.concatenate(scores)
+    assert answers >= 8
+    assert np.abs(flat).max() < 4
+    assert np.mean(flat**2) < 1.5
+    assert np.mean(np.abs(flat) < 1) > 0.6
 
 
 def test_misfit_widens_the_answer():

@@ -8,17 +8,14 @@ of FORMULAS B (11), and two lanes give the place of the camera but for the way a
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from pipeline import p3l
 from pipeline.errors import InputError
 from pipeline.ground import Ground
-from pipeline.line_triples import is_usable
-from pipeline.records import CameraModel, CloudLine, Floats, ImageLine, LineLabel
-
-_L = TypeVar("_L", CloudLine, ImageLine)
+from pipeline.line_triples import longest_lines
+from pipeline.records import CameraModel, CloudLine, Floats, ImageLine
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +77,9 @@ def lane_pair_extrinsics(
         near the LiDAR sees them so.
     """
     p = parameters or LanePairParameters()
-    lanes, poles = _longest(image_lines, "lane", p.image_lanes), _longest(image_lines, "pole", p.image_poles)
-    cloud = _longest(cloud_lines, "lane", p.cloud_lanes)
+    lanes = longest_lines(image_lines, "lane", p.image_lanes)
+    poles = longest_lines(image_lines, "pole", p.image_poles)
+    cloud = longest_lines(cloud_lines, "lane", p.cloud_lanes)
     if len(lanes) < 2 or len(cloud) < 2:
         return np.zeros((0, 4, 4))
     views = _views(_normals(lanes, camera), _normals(poles, camera), p)
@@ -110,11 +108,6 @@ def lane_pair_extrinsics(
     T = np.zeros((int(good.sum()), 4, 4))
     T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R[good], t[good], 1.0
     return T
-
-
-def _longest(lines: Sequence[_L], label: LineLabel, most: int) -> list[_L]:
-    usable = [line for line in lines if line.label == label and is_usable(line)]
-    return sorted(usable, key=lambda line: -float(np.linalg.norm(line.end - line.start)))[:most]
 
 
 def _normals(lines: Sequence[ImageLine], camera: CameraModel) -> Floats:

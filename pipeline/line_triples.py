@@ -7,7 +7,7 @@ camera, in front of the lines and above the road, may have (FORMULAS B (12), 4).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from pipeline import p3l
 from pipeline.association import OUTERMOST
 from pipeline.errors import InputError
 from pipeline.records import CameraModel, CloudLine, Floats, ImageLine, LineLabel
+
+_L = TypeVar("_L", CloudLine, ImageLine)
 
 Indices: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -104,8 +106,7 @@ def largest_lines(
     """
 
     def image(label: LineLabel, most: int) -> list[ImageLine]:
-        usable = [line for line in image_lines if line.label == label and is_usable(line)]
-        return sorted(usable, key=_length, reverse=True)[:most]
+        return longest_lines(image_lines, label, most)
 
     def cloud(label: LineLabel, most: int, *, by_angle: bool) -> list[CloudLine]:
         def size(line: CloudLine) -> float:
@@ -121,6 +122,12 @@ def largest_lines(
         cloud("lane", p.cloud_lanes, by_angle=False),
         cloud("pole", p.cloud_poles, by_angle=True),
     )
+
+
+def longest_lines(lines: Sequence[_L], label: LineLabel, most: int | None) -> list[_L]:
+    """The longest usable lines of a class; None: all."""
+    usable = [line for line in lines if line.label == label and is_usable(line)]
+    return sorted(usable, key=_length, reverse=True)[:most]
 
 
 def _length(line: CloudLine | ImageLine) -> float:

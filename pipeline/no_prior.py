@@ -1,9 +1,10 @@
 """The extrinsic of a rig of which nothing is known but the intrinsics, or next to nothing, from one frame.
 
 Two lanes of the image and two of the cloud, and up by the ground and by poles, leave some hundred extrinsics
-(``pipeline.lane_pairs``); two lanes and a pole leave some dozen (``pipeline.coarse``, CRLF III-C). J of CRLF
-(9) ranks the first by what they make of the paint; the edges of cloud and image judge the best of both
-(``pipeline.candidate_edges``). An answer that is not clearly ahead of every other one is none.
+(``pipeline.lane_pairs``); two lanes and a pole leave some dozen (``pipeline.coarse``, CRLF III-C), and where
+there are no two lanes, one lane and two poles may do (``pipeline.pole_pairs``). J of CRLF (9) ranks them; the
+edges of cloud and image judge the best (``pipeline.candidate_edges``). An answer that is not clearly ahead of
+every other one is none.
 """
 
 import math
@@ -32,6 +33,7 @@ from pipeline.ground_side import find_grounds
 from pipeline.height_maps import HeightMaps, height_maps
 from pipeline.image_lines import find_image_lines
 from pipeline.lane_pairs import LanePairParameters, lane_pair_extrinsics
+from pipeline.pole_pairs import PolePairParameters, pole_pair_extrinsics
 from pipeline.records import (
     CameraImage,
     CameraModel,
@@ -80,6 +82,7 @@ class NoPriorParameters:
         least_lead: Standard errors by which it must be ahead of the second: a rival that is as good wins
             with one in ten.
         lane_pairs: See there.
+        pole_pairs: See there.
         triples: See there.
         candidates: See there.
     """
@@ -92,6 +95,7 @@ class NoPriorParameters:
     least_peak: float = 4.0
     least_lead: float = 1.28
     lane_pairs: LanePairParameters = field(default_factory=LanePairParameters)
+    pole_pairs: PolePairParameters = field(default_factory=PolePairParameters)
     triples: coarse.CoarseParameters = field(default_factory=coarse.CoarseParameters)
     candidates: CandidateParameters = field(default_factory=CandidateParameters)
 
@@ -253,6 +257,9 @@ def _of_road(
     )
     fixed = np.zeros((0, 4, 4)) if isinstance(triples, coarse.NoCoarse) else triples.candidates
     fixed = fixed[: p.triples.finalists]
+    if len(open_place) == 0:
+        found = pole_pair_extrinsics(whole, road.image_lines, road.ground, road.camera, p.pole_pairs)
+        fixed = np.concatenate([fixed, _best_by_lines(found, points, road, p)])
     scene = Scene(road.cloud, road.ground, road.gradients, road.camera, road.origin)
     if prior is not None:
         fixed = fixed[prior.within(fixed).all(axis=1)]
@@ -289,6 +296,14 @@ def _best_by_paint(T: Floats, points: SemanticPoints, road: _Road, p: NoPriorPar
     paint = SemanticPoints(lane, points.pole[:0])
     scores = semantic_cost(T, paint, coarse.above_chance(road.maps, coarse.SEEK), road.camera)
     T = T[np.argsort(-scores, kind="stable")]
+    return T[distinct(T, p.apart_rad, p.apart_m, p.judged)]
+
+
+def _best_by_lines(T: Floats, points: SemanticPoints, road: _Road, p: NoPriorParameters) -> Floats:
+    """Of extrinsics (N,4,4) the best different ones by paint and poles."""
+    lane, pole = (xyz[:: max(1, len(xyz) // p.points)] for xyz in (points.lane, points.pole))
+    some, heights = SemanticPoints(lane, pole), coarse.above_chance(road.maps, coarse.SEEK)
+    T = T[np.argsort(-semantic_cost(T, some, heights, road.camera), kind="stable")]
     return T[distinct(T, p.apart_rad, p.apart_m, p.judged)]
 
 

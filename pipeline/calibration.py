@@ -20,7 +20,7 @@ from pipeline.ego import Ego
 from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, evened, find_tops, weighed
 from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
-from pipeline.observability import MAX_SIGMA, Observability, observable
+from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, Floats, FramePair, PointCloud, read_only
 from pipeline.rings import sensor_origin
@@ -76,7 +76,7 @@ class Calibrated:
             order of ``records.AXES``, rad and m.
         covariance: float64 (6,6) of that drift: random error, rival modes and the floor between scenes; that
             of the first guess where nothing was found.
-        observable: bool (6,), axes whose sigma is small enough (DESIGN 4).
+        observable: bool (6,), axes whose sigma is small enough (DESIGN 4), named by no held direction.
         held: Directions that are not known, named, weakest first, e.g. "pitch with up".
         reason: One clause: why something is not observable, or that all is.
         modes: The most likely first; empty where the frames have too few edges.
@@ -278,7 +278,7 @@ class Calibrator:
             T_estimated=T_estimated,
             drift=se3.mount_drift(T_guess, T_estimated, mount.R_vehicle_cam),
             covariance=covariance,
-            observable=np.sqrt(np.diag(covariance)) <= MAX_SIGMA * mount.limits,
+            observable=seen.axis_observed & ~leaning(seen).any(axis=0),
             held=held,
             reason=f"held: {', '.join(held)}" if held else "all six axes are observable",
             modes=modes,
@@ -309,11 +309,15 @@ _LEANS = 0.4
 """Share of an axis, in alert limits, from which on a direction is named after it."""
 
 
+def leaning(seen: Observability) -> NDArray[np.bool_]:
+    """For each held direction, the weakest first, the axes that it is named after, bool (H,6)."""
+    return np.asarray(np.abs(seen.directions.T[~seen.observed]) >= _LEANS)
+
+
 def held_directions(seen: Observability) -> tuple[str, ...]:
     """Names of the directions that are not observed, the weakest first: the axes that they lean on."""
-    names = []
-    for direction, observed in zip(seen.directions.T, seen.observed, strict=True):
-        if not observed:
-            order = np.argsort(-np.abs(direction))
-            names.append(" with ".join(AXES[k] for k in order if abs(direction[k]) >= _LEANS))
-    return tuple(names)
+    held = zip(seen.directions.T[~seen.observed], leaning(seen), strict=True)
+    return tuple(
+        " with ".join(AXES[k] for k in np.argsort(-np.abs(direction)) if leans[k])
+        for direction, leans in held
+    )

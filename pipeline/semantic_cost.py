@@ -20,7 +20,7 @@ from pipeline.records import CameraModel, CloudLine, Floats, PointCloud, read_on
 _BLOCK = 1 << 17
 """Points times samples looked up at once: half a MB an array, which stays in the processor's cache."""
 _MOST_POINTS = 1 << 14
-"""Points of one block: ``cv2.remap`` counts columns in 16 bits."""
+"""Points, and samples, of one block: ``cv2.remap`` counts columns and rows in 16 bits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +85,7 @@ def semantic_cost(
     for xyz, heights in ((points.lane, maps.lane), (points.pole, maps.pole)):
         for first in range(0, len(xyz), _MOST_POINTS):
             some = xyz[first : first + _MOST_POINTS]
-            step = max(1, _BLOCK // len(some))
+            step = max(1, min(_BLOCK // len(some), _MOST_POINTS))
             for k in range(0, len(total), step):
                 block = slice(k, k + step)
                 total[block] += _heights(T_cam_lidar[block], some, heights, maps, camera) / len(xyz)

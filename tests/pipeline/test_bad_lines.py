@@ -316,3 +316,13 @@ def test_searches_end_in_an_extrinsic_whatever_the_points_and_masks(kind, filled
 def test_a_generation_without_parents_is_refused(population):
     with pytest.raises(InputError, match="population"):
         EvolutionParameters(population=population)
+
+
+def test_more_candidates_than_an_image_has_rows_are_judged():
+    heights = np.linspace(0, 1, 375 * 1242, dtype=np.float32).reshape(375, 1242)
+    maps = HeightMaps(heights, heights, 1.0, 1.0)
+    point = SemanticPoints(np.array([[9.0, 1.0, -1.0]]), np.zeros((0, 3)))
+    one = semantic_cost(TRUTH[None], point, maps, CAMERA)
+    many = semantic_cost(np.tile(TRUTH, (40_000, 1, 1)), point, maps, CAMERA)
+    assert one > 0
+    assert (many == one).all()

@@ -36,7 +36,8 @@ class CalibrationParameters:
         prior: How far off the first guess may be.
         modes: How fits are sought and compared.
         most_frames: Frames of a drive that are solved jointly, evenly spread: 20 take 100 MB.
-        least_edges: Fewer edges fit anywhere: ten for each axis that is asked for.
+        least_edges: Fewer edges fit anywhere: some five of them share an object, and six axes ask for three
+            objects each.
         least_contrast: Score at the estimate over chance, minus 1 (as in the watch).
         least_peak: Height of the best fit over chance, in sigma of the score at random extrinsics: the
             highest of the ten thousand independent places within reach of the prior exceeds it in one case of
@@ -46,7 +47,7 @@ class CalibrationParameters:
     prior: Prior = field(default_factory=Prior)
     modes: ModeParameters = field(default_factory=ModeParameters)
     most_frames: int = 20
-    least_edges: int = 60
+    least_edges: int = 100
     least_contrast: float = 0.15
     least_peak: float = 4.5
 

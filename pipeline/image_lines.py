@@ -201,11 +201,18 @@ def _settled(pixels: Floats, rough: Floats, gap: float) -> tuple[Floats, Floats]
         if len(run) < _LEAST_VOTES:
             break
         mean = run.mean(axis=0)
-        axis = np.linalg.svd(run - mean, full_matrices=False)[2][0]
+        axis = _principal(run - mean)
         axis = axis if axis @ direction > 0 else -axis
         along = (run - mean) @ axis
         start, end = mean + along.min() * axis, mean + along.max() * axis
     return start, end
+
+
+def _principal(centred: Floats) -> Floats:
+    """Unit direction (2,) of largest spread of points (N,2) about their mean, in closed form."""
+    (xx, xy), (_, yy) = centred.T @ centred
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    return np.array([math.cos(angle), math.sin(angle)])
 
 
 def _pixel(point: Floats) -> tuple[int, int]:
@@ -289,7 +296,7 @@ def _fit(points: Floats, unit: float) -> _Stroke | None:
         if kept.sum() < MIN_STATIONS:
             return None
         mean = points[kept].mean(axis=0)
-        direction = np.linalg.svd(points[kept] - mean, full_matrices=False)[2][0]
+        direction = _principal(points[kept] - mean)
         across = np.abs((points - mean) @ np.array([-direction[1], direction[0]]))
         rms = float(np.sqrt((across[kept] ** 2).mean()))
         stroke = _Stroke(points[kept], mean, direction, rms)
@@ -327,7 +334,7 @@ def _joint(first: _Stroke, second: _Stroke, unit: float) -> _Stroke | None:
         return None
     points = np.concatenate([first.points, second.points])
     mean = points.mean(axis=0)
-    direction = np.linalg.svd(points - mean, full_matrices=False)[2][0]
+    direction = _principal(points - mean)
     across = (points - mean) @ np.array([-direction[1], direction[0]])
     offsets = [abs(float(part.mean())) for part in np.split(across, [len(first.points)])]
     rms = float(np.sqrt((across**2).mean()))

@@ -30,6 +30,8 @@ MAX_WIDTH_M = 0.7
 """m along the track: lines of 0.3 m crossed at 40 deg, with the inner window around them."""
 TRACK_RAD = math.radians(0.4)
 """rad of depression that a track takes in where rings have no number: about one ring of a 64-beam sensor."""
+LEAST_HEIGHT_M = 1.0
+"""m; taken for the sensor's height where it seems lower: a cloud may be told from a place on the ground."""
 _SPLIT_M = 0.3
 """m between points of a track beyond which marks are two; farther rays of a sensor lie 0.2 m apart."""
 _FAR_M = 1e3
@@ -70,7 +72,7 @@ def along_tracks(plan: Floats, shade: Floats, ring: Indices | None, height: floa
     """
     reach = np.hypot(plan[:, 0], plan[:, 1])
     if ring is None:
-        ring = np.floor(np.arctan2(abs(height), reach) / TRACK_RAD).astype(np.int64)
+        ring = np.floor(np.arctan2(max(abs(height), LEAST_HEIGHT_M), reach) / TRACK_RAD).astype(np.int64)
     azimuth = _azimuth(plan)
     order = np.lexsort((azimuth, ring))
     step = np.diff(azimuth[order]) * np.minimum(reach[order][1:], reach[order][:-1])

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from tests.bench import drive, environment
+from tests.bench.lines import TARGETS_MS
 from tests.bench.stages import Measured, measure
 
 THREADS = (1, 2)
@@ -33,6 +34,7 @@ def main(arguments: list[str]) -> None:
     for location in recordings:
         runs = {threads: _run(location, threads) for threads in THREADS}
         _tell(_stages(Path(location).name, runs))
+        _tell(_lines(runs[THREADS[0]]))
         _tell(_ratios(runs[THREADS[0]]))
     _tell(environment.tables())
 
@@ -79,6 +81,13 @@ def _stages(name: str, runs: dict[int, Measured]) -> str:
     lines.append("| whole frame | " + " | ".join(totals) + " |")
     peaks = ", ".join(f"{run['peak_mb']:.0f} MB (threads: {n})" for n, run in runs.items())
     return "\n".join([*lines, "", f"Largest resident memory: {peaks}."])
+
+
+def _lines(run: Measured) -> str:
+    rows = [f"| {step} | {spent:.1f} | {TARGETS_MS.get(step, '')} |" for step, spent in run["lines"].items()]
+    return "\n".join(
+        ["| lines, one frame, one thread | process time, ms | target, ms |", "|---|---|---|", *rows]
+    )
 
 
 def _ratios(run: Measured) -> str:

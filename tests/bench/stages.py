@@ -20,9 +20,9 @@ from monitor.sources import open_source
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.parameters import Parameters
 from pipeline.records import CameraImage, FramePair, PointCloud
-from pipeline.segmentation import Segmenter
+from pipeline.segmentation import Segmenter, grid_scale
 from pipeline.watch import Mount, Watch
-from tests.bench import dense_crf
+from tests.bench import dense_crf, lines
 from tests.bench.dense_crf import least
 
 STAGES = {
@@ -61,6 +61,7 @@ class Measured(TypedDict):
     image: str
     stages: dict[str, Cost]
     ratios: dict[str, float]
+    lines: dict[str, float]
     peak_mb: float
 
 
@@ -121,6 +122,7 @@ def measure(location: str, threads: int) -> Measured:
         image=f"{width}x{height}",
         stages=stages,
         ratios=ratios,
+        lines=_of_lines(mount, parameters, segmenter, newest) if threads == 1 else {},
         peak_mb=peak_mb,
     )
 
@@ -175,6 +177,19 @@ def _of_masks(
     return {"masks: without CRF / with": costs[plain] / costs[parameters.masks]} | dense_crf.measure(
         seen, pixels, lambda: masks_from_probabilities(seen, pixels, parameters.masks, horizon)
     )
+
+
+def _of_lines(
+    mount: Mount, parameters: Parameters, segmenter: Segmenter, pair: FramePair
+) -> dict[str, float]:
+    """What lines cost on one frame, with the masks that the watch makes of it."""
+    pixels = pair.image.pixels
+    horizon = horizon_line(mount.camera, mount.T_cam_lidar[:3, :3] @ mount.up)
+    scale = grid_scale(*pair.image.size)
+    masks = masks_from_probabilities(
+        segmenter.probabilities(pixels), pixels, parameters.masks, horizon, scale
+    )
+    return lines.costs(pair, masks, mount)
 
 
 def _of_judgements(location: str, mount: Mount, parameters: Parameters, intake: Intake) -> dict[str, float]:

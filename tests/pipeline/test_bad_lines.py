@@ -247,10 +247,14 @@ def test_p3l_gives_rotations_or_says_why_not(seed, kind):
     R = T[roots.valid, :, :3, :3]
     assert np.allclose(R @ R.transpose(0, 1, 3, 2), np.eye(3), atol=1e-6)
     assert np.allclose(np.linalg.det(R), 1.0, atol=1e-6)
-    if kind in (0, 1, 2):
-        assert not roots.valid[:4].any()
-    if kind == 5:
-        assert not roots.valid.any()
+    one_plane, ahead, along = (
+        p3l.Degeneracy.LANES_IN_ONE_PLANE,
+        p3l.Degeneracy.POLE_DEAD_AHEAD,
+        p3l.Degeneracy.POLE_ALONG_LANES,
+    )
+    wanted = {0: [one_plane] * 4, 1: [one_plane] * 4, 2: [ahead] * 4, 5: [one_plane] * 4 + [along] * 4}
+    told = wanted.get(kind, [])
+    assert roots.degeneracy[: len(told)].tolist() == told
 
 
 @pytest.fixture(scope="module")

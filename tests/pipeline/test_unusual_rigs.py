@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline import se3
-from pipeline.cameras import ideal_pixels, project, undistort
+from pipeline.association import associate
+from pipeline.cameras import ideal_pixels, lens_of, limit_of, project, undistort
 from pipeline.line_witness import find_lines, in_view, solve_lines
 from pipeline.observability import in_vehicle_axes, observable
-from pipeline.records import CameraModel, Masks, PointCloud
+from pipeline.records import CameraModel, CloudLine, ImageLine, Masks, PointCloud
 from pipeline.simulation.drive import START_NS, Drive, DriveParameters
 from pipeline.simulation.lidar import spinning
 from pipeline.structure_lines import find_structure_lines
@@ -256,6 +257,25 @@ def test_rays_are_those_of_the_closed_form(lens):
         ideal = ideal_pixels(camera, uv[seen])
         across = np.linalg.svd(ideal - ideal.mean(axis=0))[1][1]
         assert across < 1e-6 < np.linalg.svd(uv[seen] - uv[seen].mean(axis=0))[1][1]
+
+
+def test_beyond_the_fold_nothing_projects_and_no_line_is_paired():
+    """A polynomial lens would draw such a line again inside the image (FORMULAS E3)."""
+    camera = WIDE["plumb_bob"]
+    limit = limit_of(camera)
+    x = np.linspace(1.01 * limit, 4.0 * limit, 300)
+    beyond = 10.0 * np.column_stack([x, np.full(300, 0.05), np.ones(300)])
+    folded = lens_of(camera).distort(beyond[:, :2] / 10.0, camera.D) @ camera.K[:2, :2].T + camera.K[:2, 2]
+    assert ((folded > 0) & (folded < (camera.width, camera.height))).all(axis=1).any()
+    uv, valid = project(camera, beyond)
+    assert not valid.any()
+    assert np.isnan(uv).all()
+    cloud = CloudLine("lane", beyond[0], beyond[-1], np.arange(300), 0.02, 1e4)
+    ends = np.array([[-limit, 0.05], [limit, 0.05]]) @ camera.K[:2, :2].T + camera.K[:2, 2]
+    image = ImageLine("lane", ends[0], ends[1], 0.5)
+    assert not associate([cloud], [image], camera, np.eye(4), np.eye(6)).matches
+    within = CloudLine("lane", beyond[0] * (-0.5, 1, 1), beyond[0] * (0.5, 1, 1), np.arange(300), 0.02, 1e4)
+    assert len(associate([within], [image], camera, np.eye(4), 1e-4 * np.eye(6)).matches) == 1
 
 
 def test_a_point_cloud_of_nothing_keeps_the_rig_silent(front):

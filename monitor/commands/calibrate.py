@@ -82,10 +82,8 @@ def command(
         if no_prior or prior_sigma is not None or masks:
             sigma = None if no_prior else prior_sigma or MASK_PRIOR
             guesses = _guesses(recording, rig_file, drift, sigma, masks, model, stop)
-            if not guesses and not stop.is_set():
-                return EXIT_CODES["unobservable"]
         results: tuple[Calibration, ...] = ()
-        if not stop.is_set():
+        if (guesses is None or guesses) and not stop.is_set():
             results = calibrate(
                 recording,
                 rig_file,

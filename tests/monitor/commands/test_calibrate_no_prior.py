@@ -78,6 +78,8 @@ def test_a_scene_that_can_not_give_it_says_why(calibwatch, bare):
     code, out, err = calibwatch("calibrate", bare, "--no-prior", "--mask", mask)
     assert (code, out) == (4, "")
     assert err == "pair camera, frame 0: fewer than two lanes in the image\n"
+    code, out, _ = calibwatch("calibrate", bare, "--no-prior", "--mask", mask, "--json")
+    assert (code, out) == (4, "[]\n")
 
 
 @pytest.mark.parametrize(

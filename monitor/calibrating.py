@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from monitor.daemon import extrinsic_hash, mount_of
@@ -76,6 +77,7 @@ def calibrate(
     progress: Callable[[int], None] | None,
     tell: Callable[[str], None] = lambda _: None,
     guesses: Mapping[str, Floats] | None = None,
+    prior: Prior | None = None,
 ) -> tuple[Calibration, ...]:
     """Estimates the extrinsic of every pair of a recording.
 
@@ -90,18 +92,22 @@ def calibrate(
         tell: Told what of the recording was lost or dropped, one sentence each.
         guesses: First guesses float64 (4,4) by pair, in place of the stored extrinsics, which may be absent;
             pairs without one are left out. None: the stored ones.
+        prior: How far off stored extrinsics may be, guesses that equal them among them; None: as a mount that
+            drifted.
 
     Raises:
         CalibwatchError: Recording, rig or model can not be used.
     """
     rig = prepare(location, rig_file, drift, needs_extrinsic=guesses is None).rig
+    found = frozenset[str]() if guesses is None else _found(rig, guesses)
     if guesses is not None:
         rig = _guessed(rig, guesses)
     truth = {} if reference is None else _truth(reference, rig)
-    settings = CalibrationParameters(prior=Prior() if guesses is None else FOUND)
+    stored, far = CalibrationParameters(prior=prior or Prior()), CalibrationParameters(prior=FOUND)
     segmenter = Segmenter(model_bytes(model))
     calibrators = {
-        pair.name: Calibrator(mount_of(pair), Parameters(), segmenter, settings) for pair in rig.pairs
+        pair.name: Calibrator(mount_of(pair), Parameters(), segmenter, far if pair.name in found else stored)
+        for pair in rig.pairs
     }
     intake = Intake(rig)
     accounts = {
@@ -122,6 +128,16 @@ def calibrate(
     results = (_result(name, one.mount, one.finish(), truth.get(name)) for name, one in calibrators.items())
     relative_to = "stored" if guesses is None else "found"
     return tuple(result.model_copy(update={"relative_to": relative_to}) for result in results)
+
+
+def _found(rig: Rig, guesses: Mapping[str, Floats]) -> frozenset[str]:
+    """The pairs whose guess was found; a guess that is the stored extrinsic is as far off as that may be."""
+    return frozenset(
+        pair.name
+        for pair in rig.pairs
+        if pair.name in guesses
+        and (pair.T_cam_lidar is None or not np.array_equal(pair.T_cam_lidar, guesses[pair.name]))
+    )
 
 
 def _guessed(rig: Rig, guesses: Mapping[str, Floats]) -> Rig:

@@ -73,14 +73,16 @@ def command(
     The stored extrinsic is not changed. Exit code 4: not one axis is observable, or nothing was found.
     """
     from monitor.calibrating import calibrate  # noqa: PLC0415 - numpy and OpenCV are not needed for --help
+    from pipeline.frame_modes import Prior  # noqa: PLC0415 - as above
 
     if no_prior and (prior_sigma is not None or drift is not None):
         other = "--inject" if prior_sigma is None else "--prior-sigma"
         raise click.UsageError(f"--no-prior looks at no stored extrinsic: {other} has no meaning with it")
     with commands.stop_on_signal() as stop:
-        guesses = None
+        guesses, prior = None, None
         if no_prior or prior_sigma is not None or masks:
             sigma = None if no_prior else prior_sigma or MASK_PRIOR
+            prior = None if sigma is None else Prior(math.radians(sigma[0]), sigma[1])
             guesses = _guesses(recording, rig_file, drift, sigma, masks, model, stop)
         results: tuple[Calibration, ...] = ()
         if (guesses is None or guesses) and not stop.is_set():
@@ -94,6 +96,7 @@ def command(
                 progress=commands.progress_line("pairs read:"),
                 tell=_warn,
                 guesses=guesses,
+                prior=prior,
             )
     if as_json:
         click.echo(json.dumps([result.model_dump(mode="json") for result in results], indent=2))

@@ -10,6 +10,8 @@ from pipeline.frame_modes import ModeParameters, Prior
 from pipeline.observability import observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, FramePair, PointCloud
+from pipeline.simulation.drive import Drive
+from pipeline.simulation.rigs import draw_rig
 from pipeline.watch import Mount
 
 QUICK = CalibrationParameters(modes=ModeParameters(draws=64, climbed=2, draws_of_place=8))
@@ -43,6 +45,26 @@ def test_a_single_frame_finds_back_from_two_degrees_with_honest_sigma(drive, str
     assert np.allclose(found.drift, drift, atol=4.0 * found.sigma.max())
     assert found.modes[0].share == max(mode.share for mode in found.modes)
     assert sum(mode.share for mode in found.modes) == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+def test_sigma_is_honest_on_streets_and_rigs_of_all_kinds(limits):
+    errors = []
+    for seed in range(16):
+        rng = np.random.default_rng([11, seed])
+        parameters = draw_rig(rng)
+        drive = Drive(parameters)
+        # Single sweeps are not straightened: the way driven while they last is an error of its own.
+        frame = drive.frame(0)
+        mount = mount_of(drive, limits, rng.uniform(-2.0, 2.0, 6) * Prior().sigma)
+        found = calibrate_frames(mount, [pair_of(frame)])
+        error = se3.mount_drift(parameters.T_stored, found.T_estimated, mount.R_vehicle_cam)
+        errors.extend((error / found.sigma)[found.observable])
+    normalised = np.abs(errors)
+    assert len(normalised) >= 60
+    assert 0.6 <= np.mean(normalised < 1.0) <= 0.9
+    assert np.mean(normalised < 2.0) >= 0.88
+    assert np.mean(normalised > 4.0) <= 0.05
 
 
 def test_an_image_of_another_place_gives_nothing_and_the_guess_stays(drive, straight_frames, limits):

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.cloud_lanes import find_lanes
 from pipeline.cloud_poles import find_poles
-from pipeline.coarse import coarse_extrinsic
+from pipeline.coarse import CoarseSolution, NoCoarse, coarse_extrinsic
 from pipeline.ground import fit_ground
 from pipeline.height_maps import Mode, height_maps
 from pipeline.image_lines import find_image_lines
@@ -65,12 +65,19 @@ def _solvers(pair: FramePair, masks: Masks, mount: Mount) -> dict[str, float]:
     points = points_of_lines(pair.cloud, lines.cloud_lines)
     plateau, ridge = (height_maps(masks, camera, mode) for mode in _MODES)
     found = {
-        "coarse extrinsic": least(
-            lambda: coarse_extrinsic(lines.cloud_lines, lines.image_lines, points, plateau, camera)
-        ),
-        "refinement, a frame": least(lambda: solve_lines([lines] * _WINDOW, camera, T)) / _WINDOW,
+        "coarse extrinsic": float("nan"),
+        "refinement, a frame": float("nan"),
         "Algorithm 1, 4 x 2500 samples": float("nan"),
     }
+
+    def coarse() -> CoarseSolution | NoCoarse:
+        return coarse_extrinsic(lines.cloud_lines, lines.image_lines, points, plateau, camera)
+
+    # Giving up is quick and tells nothing.
+    if isinstance(coarse(), CoarseSolution):
+        found["coarse extrinsic"] = least(coarse)
+    if solve_lines([lines] * _WINDOW, camera, T).matches[0]:
+        found["refinement, a frame"] = least(lambda: solve_lines([lines] * _WINDOW, camera, T)) / _WINDOW
     visible = points_in_view(points, camera, T)
     if len(visible.lane) and len(visible.pole):
         stages = (plateau, plateau, ridge, ridge)

@@ -63,15 +63,19 @@ def calibrated(
     prior = Prior()
     if prior_sigma is not None:
         with times.stage("first guess"):
-            mount = _guessed(frame, mount, segmenter, prior_sigma)
-        prior = FOUND
+            guess = _found(frame, mount, segmenter, prior_sigma)
+        if guess is None:
+            # What was not found is as far off as the stored extrinsic that it is.
+            prior = Prior(prior_sigma.sigma_rad, prior_sigma.sigma_m)
+        else:
+            mount, prior = dataclasses.replace(mount, T_cam_lidar=guess), FOUND
     calibrator = Calibrator(mount, Parameters(), segmenter, CalibrationParameters(prior=prior))
     calibrator.step(frame.pair, times.stage)
     return calibrator.finish(times.stage)
 
 
-def _guessed(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, sigma: PriorSigma) -> Mount:
-    """The mount with what is found around its extrinsic; as it is where that is nothing."""
+def _found(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, sigma: PriorSigma) -> Floats | None:
+    """The extrinsic (4,4) that is found around that of a mount, or None."""
     horizon = horizon_line(mount.camera, mount.R_vehicle_cam[2])
     found = find_extrinsic(
         frame.pair.cloud,
@@ -81,9 +85,7 @@ def _guessed(frame: EvaluatedFrame, mount: Mount, segmenter: Segmenter, sigma: P
         np.random.default_rng([Parameters().seed, 0]),
         prior=no_prior.Prior(mount.T_cam_lidar, sigma.sigma_rad, sigma.sigma_m),
     )
-    if not isinstance(found, FoundExtrinsic):
-        return mount
-    return dataclasses.replace(mount, T_cam_lidar=found.T_cam_lidar)
+    return found.T_cam_lidar if isinstance(found, FoundExtrinsic) else None
 
 
 def lines_around(frame: EvaluatedFrame, rng: np.random.Generator) -> tuple[list[CloudLine], Ground | None]:

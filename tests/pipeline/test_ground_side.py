@@ -77,3 +77,15 @@ def test_a_ball_of_noise_has_no_ground():
 
 def test_points_at_one_place_have_no_ground():
     assert find_grounds(cloud_of(np.ones((500, 3))), np.random.default_rng(1)) == ()
+
+
+def test_a_fence_with_something_behind_it_is_not_the_ground():
+    """Larger than what is seen of the road, but with a garden beyond: a ground has nothing below."""
+    rng = np.random.default_rng(7)
+    fence = plane(rng, ((-25, 25), (-1.7, 8.3)), 4.4, 8000)[:, [0, 2, 1]]
+    road = plane(rng, ((-25, 25), (-3.3, 4.3)), -1.7)
+    behind = rng.uniform([-5, 6, -1.5], [5, 16, 6], (8000, 3))
+    xyz = np.concatenate([fence, road, behind])
+    found = find_grounds(cloud_of(xyz + rng.normal(0, 0.02, xyz.shape)), rng)
+    assert found[0].normal @ UP > 0.999
+    assert found[0].offset == pytest.approx(1.7, abs=0.05)

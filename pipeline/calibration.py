@@ -13,18 +13,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import se3
+from pipeline import fusion, line_witness, se3
 from pipeline.edge_witness import EdgeBatch, EdgeFrame, batch_of
 from pipeline.edges import Edges, find_edges
 from pipeline.ego import Ego
 from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, evened, find_tops, weighed
+from pipeline.fusion import Testimony
 from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
+from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
-from pipeline.records import AXES, Floats, FramePair, PointCloud, read_only
+from pipeline.records import AXES, CameraImage, Floats, FramePair, PointCloud, read_only
 from pipeline.rings import sensor_origin
-from pipeline.segmentation import Segmenter
+from pipeline.segmentation import Segmenter, grid_scale
 from pipeline.watch import DropReason, Mount, Stage
 
 
@@ -36,6 +38,9 @@ class CalibrationParameters:
         prior: How far off the first guess may be.
         modes: How fits are sought and compared.
         most_frames: Frames of a drive that are solved jointly, evenly spread: 20 take 100 MB.
+        line_frames: Frames of a drive whose lines are held against the answer of the edges: the network takes
+            longer than all the rest.
+        least_line_fit: Chance of right pairs of lines to fit each other no better; below it some are wrong.
         least_edges: Fewer edges fit anywhere: some five of them share an object, and six axes ask for three
             objects each.
         least_contrast: Score at the estimate over chance, minus 1 (as in the watch).
@@ -47,6 +52,8 @@ class CalibrationParameters:
     prior: Prior = field(default_factory=Prior)
     modes: ModeParameters = field(default_factory=ModeParameters)
     most_frames: int = 20
+    line_frames: int = 4
+    least_line_fit: float = 1e-3
     least_edges: int = 100
     least_contrast: float = 0.15
     least_peak: float = 4.5
@@ -137,6 +144,7 @@ class _Kept:
 
     stamp_ns: int
     cloud: PointCloud
+    image: CameraImage
     ground: Ground | None
     edges: Edges
     gradients: GradientPyramid
@@ -214,7 +222,9 @@ class Calibrator:
             return "no_edges"
         with stage("gradients"):
             gradients = gradient_pyramid(pair.image, self.mount.camera)
-        self._kept.append(_Kept(pair.image_stamp_ns, pair.cloud, ground, edges, gradients, distance_m))
+        self._kept.append(
+            _Kept(pair.image_stamp_ns, pair.cloud, pair.image, ground, edges, gradients, distance_m)
+        )
         if len(self._kept) > self._settings.most_frames:
             self._kept = self._kept[::2]
             self._stride *= 2
@@ -235,7 +245,47 @@ class Calibrator:
             # The edges in view, and which stand for what part of it, are those of the best fit.
             there = self._picked_again(se3.retract(T_guess, tops[0][0]))
             found = weighed(self._batch(there), T_guess, tops, prior, modes, rng)
-        return self._result(found)
+        with stage("lines"):
+            lines = self._lines_at(se3.retract(T_guess, found.tops[0][0]))
+        return self.judged(found, lines)
+
+    def _lines_at(self, T_best: Floats) -> Testimony | None:
+        """What lanes and poles say against the best fit, vehicle axes; None where they say nothing."""
+        if self._segmenter is None:
+            return None
+        mount = dataclasses.replace(self.mount, T_cam_lidar=T_best)
+        rng = np.random.default_rng(self._parameters.seed)
+        horizon = horizon_line(mount.camera, T_best[:3, :3] @ mount.up)
+        frames = []
+        for kept in self._kept[:: -(-len(self._kept) // self._settings.line_frames)]:
+            pixels = kept.image.pixels
+            masks = masks_from_probabilities(
+                self._segmenter.probabilities(pixels),
+                pixels,
+                self._parameters.masks,
+                horizon,
+                grid_scale(*kept.image.size),
+            )
+            frames.append(
+                line_witness.find_lines(
+                    kept.cloud,
+                    kept.image,
+                    masks,
+                    mount.camera,
+                    T_best,
+                    up=mount.up,
+                    forward=mount.forward,
+                    rng=rng,
+                    ground=kept.ground,
+                )
+            )
+        solution = line_witness.solve_lines(frames, mount.camera, T_best)
+        estimate = solution.estimate
+        if estimate.features == 0 or solution.fit < self._settings.least_line_fit:
+            return None
+        B = se3.vehicle_block(mount.R_vehicle_cam)
+        own = Testimony(B @ estimate.xi, B @ estimate.information @ B.T)
+        return fusion.with_floor(own, self._parameters.test.lines_floor())
 
     def _picked_again(self, T_cam_lidar: Floats) -> list[_Kept]:
         """The frames with the edges in view from another extrinsic; as before where one has none."""
@@ -255,22 +305,31 @@ class Calibrator:
         )
         return evened(joined)
 
-    def _result(self, found: EdgeModes) -> Calibrated:
-        """Estimate, errors and words from the modes."""
+    def judged(self, found: EdgeModes, lines: Testimony | None) -> Calibrated:
+        """Estimate, errors and words from the modes.
+
+        Args:
+            found: Where the edges fit.
+            lines: What the lines say against the best fit, vehicle axes, or None: it may contradict.
+        """
         mount = self.mount
         T_guess = mount.T_cam_lidar
         modes = tuple(
             Mode(read_only(se3.retract(T_guess, xi)), score, float(share))
             for (xi, score), share in zip(found.tops, found.shares, strict=True)
         )
-        if found.contrast < self._settings.least_contrast or found.peak < self._settings.least_peak:
-            why = "image and cloud show nothing in common (dark, blocked, no edges, or a first guess far off)"
-            return dataclasses.replace(
-                self._nothing(why), modes=modes, contrast=found.contrast, peak=found.peak
-            )
         B = se3.vehicle_block(mount.R_vehicle_cam)
         covariance = B @ found.covariance @ B.T + self._parameters.test.floor()
         information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        why = ""
+        if found.contrast < self._settings.least_contrast or found.peak < self._settings.least_peak:
+            why = "image and cloud show nothing in common (dark, blocked, no edges, or a first guess far off)"
+        elif lines is not None and fusion.contradiction(Testimony(np.zeros(6), information), lines):
+            why = "lines and edges contradict each other beyond their errors"
+        if why:
+            return dataclasses.replace(
+                self._nothing(why), modes=modes, contrast=found.contrast, peak=found.peak
+            )
         seen = observable(information, mount.limits)
         # Held directions keep the first guess (FORMULAS D3).
         T_estimated = se3.retract(T_guess, B.T @ seen.restrict(B @ found.tops[0][0]))

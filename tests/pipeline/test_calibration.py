@@ -1,15 +1,17 @@
 import dataclasses
 import math
 
+import cv2
 import numpy as np
 import pytest
 
-from pipeline import se3
+from pipeline import fusion, labels, se3
 from pipeline.calibration import CalibrationParameters, Calibrator, calibrate_frames, held_directions, leaning
-from pipeline.frame_modes import ModeParameters, Prior
+from pipeline.frame_modes import EdgeModes, ModeParameters, Prior
 from pipeline.observability import observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, FramePair, PointCloud
+from pipeline.segmentation import grid_size
 from pipeline.simulation.drive import Drive
 from pipeline.simulation.rigs import draw_rig
 from pipeline.watch import Mount
@@ -127,6 +129,48 @@ def test_a_long_drive_is_thinned_evenly_and_every_pair_counts(drive, straight_fr
     found = calibrator.finish(stage)
     assert found.frames == 9
     assert {"search", "refinement"} <= set(edges_found)
+
+
+class Seeing:
+    """In place of the network: the true labels of one picture."""
+
+    def __init__(self, classes):
+        columns, rows = grid_size(classes.shape[1], classes.shape[0])
+        self._answer = np.stack(
+            [
+                cv2.resize((classes == k).astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+                for k in range(len(labels.NAMES))
+            ]
+        )
+
+    def probabilities(self, pixels):
+        del pixels
+        return self._answer
+
+
+def test_lines_that_agree_with_the_edges_change_nothing(drive, straight_frames, limits):
+    frame, mount = straight_frames[1], mount_of(drive, limits)
+    alone = calibrate_frames(mount, [pair_of(frame)], settings=QUICK)
+    heard = calibrate_frames(mount, [pair_of(frame)], None, Seeing(frame.labels), QUICK)
+    assert heard.observable.all()
+    assert np.array_equal(heard.T_estimated, alone.T_estimated)
+
+
+@pytest.mark.parametrize(("yaw_deg", "believed"), [(0.3, True), (2.0, False)])
+def test_lines_that_contradict_the_edges_take_the_claim_back(drive, limits, yaw_deg, believed):
+    mount = mount_of(drive, limits)
+    calibrator = Calibrator(mount, Parameters(), None, CalibrationParameters())
+    spread = np.diag(np.array([math.radians(0.1)] * 3 + [0.02] * 3) ** 2)
+    xi = 0.5 * Prior().sigma
+    edges = EdgeModes(((xi, 0.4),), np.array([1.0]), spread, contrast=1.0, peak=9.0)
+    drift = np.array([0.0, 0.0, math.radians(yaw_deg), 0.0, 0.0, 0.0])
+    lines = fusion.with_floor(fusion.Testimony(drift, np.linalg.inv(spread)), Parameters().test.lines_floor())
+    found = calibrator.judged(edges, lines)
+    assert bool(found.observable.all()) is believed
+    assert ("contradict" in found.reason) is not believed
+    kept = se3.retract(mount.T_cam_lidar, xi) if believed else mount.T_cam_lidar
+    assert np.allclose(found.T_estimated, kept, atol=1e-9)
+    assert calibrator.judged(edges, None).observable.all()
 
 
 class contextless:  # noqa: N801 - a context manager, named as one

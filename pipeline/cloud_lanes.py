@@ -119,8 +119,10 @@ def _rows(paint: _Paint, rng: np.random.Generator) -> list[Indices]:
         refined = list({row.tobytes(): row for row in (_refined(plan, start) for start in starts)}.values())
         clear = [_clearness(paint, chosen[row]) for row in refined]
         best = int(np.argmax(clear))
-        if clear[best] >= SURE_SIGMAS:
-            free &= ~_claims(plan[refined[best]], plan)
+        taken = free & _claims(plan[refined[best]], plan) if clear[best] >= SURE_SIGMAS else None
+        # A row may settle on marks of an earlier one: it takes nothing more, and would come again for ever.
+        if taken is not None and taken.any():
+            free &= ~taken
             row = _backed(paint, chosen[refined[best]])
             if _long_enough(marks, row):
                 rows.append(_members(paint, row))

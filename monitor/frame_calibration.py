@@ -22,6 +22,7 @@ from pipeline.masks import horizon_line
 from pipeline.no_prior import FoundExtrinsic, find_extrinsic
 from pipeline.parameters import Parameters
 from pipeline.records import CloudLine, Floats
+from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter
 from pipeline.watch import Mount
 
@@ -95,7 +96,9 @@ def lines_around(frame: EvaluatedFrame, rng: np.random.Generator) -> tuple[list[
     if ground is None:
         return [], None
     everywhere = np.ones(len(cloud), dtype=np.bool_)
-    return [*find_lanes(cloud, ground, everywhere, rng), *find_poles(cloud, ground, everywhere)], ground
+    origin = sensor_origin(cloud)
+    lanes = find_lanes(cloud, ground, everywhere, rng, origin=origin)
+    return [*lanes, *find_poles(cloud, ground, everywhere, origin=origin)], ground
 
 
 def drawn_start(frame: EvaluatedFrame, start: int, widest: Floats, seed: int) -> Floats:

@@ -277,6 +277,7 @@ class Calibrator:
                     forward=mount.forward,
                     rng=rng,
                     ground=kept.ground,
+                    origin=self._origin,
                 )
             )
         solution = line_witness.solve_lines(frames, mount.camera, T_best)

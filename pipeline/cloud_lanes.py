@@ -63,7 +63,9 @@ MAX_FAILURES = 4
 """Rows that turned out to be none before the search ends: the strongest come first."""
 
 
-def find_lanes(cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Generator) -> list[CloudLine]:
+def find_lanes(
+    cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Generator, *, origin: Floats | None = None
+) -> list[CloudLine]:
     """Finds the painted lines of a sweep.
 
     Args:
@@ -71,14 +73,18 @@ def find_lanes(cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Ge
         ground: Its ground.
         seen: bool (N,), points that may take part (those in view of the camera).
         rng: Draws the pairs.
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+            its origin.
 
     Returns:
         Lines in no particular order; dashes of one line are one line.
     """
     if cloud.intensity is None:
         return []
+    sensor = np.zeros(3) if origin is None else origin
     index = unrepeated(cloud.xyz, np.flatnonzero(ground.inliers & seen))
-    plan = np.asarray(cloud.xyz[index], dtype=np.float64) @ plane_basis(ground.normal).T
+    # Tracks of beams and ranges are those about the sensor, wherever the cloud's frame has its origin.
+    plan = (cloud.xyz[index] - sensor) @ plane_basis(ground.normal).T
     reach = np.hypot(plan[:, 0], plan[:, 1])
     near = (reach > LANE_RANGE_M[0]) & (reach < LANE_RANGE_M[1])
     index, plan, reach = index[near], plan[near], reach[near]
@@ -86,7 +92,7 @@ def find_lanes(cloud: PointCloud, ground: Ground, seen: Bools, rng: np.random.Ge
     ring = None
     if cloud.ring is not None and has_rings(cloud):
         ring = cloud.ring[index].astype(np.int64)
-    paint = _Paint(plan, shade, along_tracks(plan, shade, ring, ground.offset))
+    paint = _Paint(plan, shade, along_tracks(plan, shade, ring, float(ground.heights(sensor))))
     lines = []
     for row in _rows(paint, rng):
         members = index[row]

@@ -60,7 +60,9 @@ MIN_SLOPE_REACH_M = 2.0
 """m, horizontal; nearer returns come from the vehicle itself and say nothing of the highest beam."""
 
 
-def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> list[CloudLine]:
+def find_poles(
+    cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_], *, origin: Floats | None = None
+) -> list[CloudLine]:
     """Free-standing, thin, upright objects (CRLF (5), (6), heights above the fitted ground: FORMULAS B).
 
     The sensor sees only the front of a pole. For returns spread evenly over a round front their mean lies
@@ -72,23 +74,27 @@ def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> li
         cloud: The sweep.
         ground: Its ground plane.
         seen: bool (N,), points that may take part (those in view of the camera).
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+            its origin.
 
     Returns:
         Lines from foot to top, in no particular order.
     """
-    basis = plane_basis(ground.normal).astype(np.float32)
+    sensor = np.zeros(3) if origin is None else origin
+    basis = plane_basis(ground.normal)
     index = unrepeated(cloud.xyz, np.flatnonzero(seen))
     height = ground.local_heights(cloud.xyz[index])
     tall = (height > BOTTOM_M) & (height < CEILING_M)
     index, height = index[tall], height[tall]
-    plan = (cloud.xyz[index] @ basis.T).astype(np.float64)
+    xyz = cloud.xyz[index].astype(np.float64)
+    plan = (xyz - sensor) @ basis.T
     near = np.hypot(plan[:, 0], plan[:, 1]) < POLE_RANGE_M
-    index, plan, height = index[near], plan[near], height[near]
+    index, xyz, plan, height = index[near], xyz[near], plan[near], height[near]
     if len(index) < MIN_POLE_POINTS:
         return []
-    xyz = cloud.xyz[index].astype(np.float64)
-    returns = _Returns(index, xyz, plan, height, ground.heights(xyz) - height)
-    candidates = _pole_candidates(returns, ground.offset, _top_slope(cloud, ground, basis))
+    returns = _Returns(index, xyz, plan, height, ground.heights(xyz) - height, sensor)
+    top_slope = _top_slope(cloud, ground.normal, basis, sensor)
+    candidates = _pole_candidates(returns, float(ground.heights(sensor)), top_slope)
     poles = []
     for members in sorted(candidates, key=len, reverse=True)[:MOST_CANDIDATES]:
         line = _pole(returns, ground, members)
@@ -101,7 +107,8 @@ def find_poles(cloud: PointCloud, ground: Ground, seen: NDArray[np.bool_]) -> li
 class _Returns:
     """Points above ground: index in the cloud, (M,3), (M,2) in the plan, height above the ground below (M,).
 
-    ``rise`` (M,) is the height of that ground above the main plane.
+    ``rise`` (M,) is that ground above the main plane; the sensor stands at ``sensor`` (3,) of the
+    cloud's frame and above the origin of the plan.
     """
 
     index: Indices
@@ -109,16 +116,17 @@ class _Returns:
     plan: Floats
     up: Floats
     rise: Floats
+    sensor: Floats
 
 
-def _top_slope(cloud: PointCloud, ground: Ground, basis: np.ndarray) -> float:
+def _top_slope(cloud: PointCloud, normal: Floats, basis: Floats, sensor: Floats) -> float:
     """Tangent of the highest beam against the ground plane, from the cloud itself."""
-    thinned = cloud.xyz[:: max(1, len(cloud) // 20_000)]
+    thinned = cloud.xyz[:: max(1, len(cloud) // 20_000)] - sensor
     reach = np.hypot(*(thinned @ basis.T).T)
     far = reach > MIN_SLOPE_REACH_M
     if not far.any():
         return 0.0
-    slope = (thinned[far] @ ground.normal.astype(np.float32)) / reach[far]
+    slope = (thinned[far] @ normal) / reach[far]
     return float(np.quantile(slope, 0.999))
 
 
@@ -195,7 +203,7 @@ def _axis(returns: _Returns, ground: Ground, near: Indices, shaft: NDArray[np.bo
     )
     if not stands:
         return None
-    moved = _behind_the_front(axis, _across(xyz[pole], axis), ground)
+    moved = _behind_the_front(axis, _across(xyz[pole], axis), ground, returns.sensor)
     return cloud_line("pole", moved, returns.index[near[pole]])
 
 
@@ -217,11 +225,12 @@ def _across(xyz: Floats, axis: FittedAxis) -> Floats:
     return np.asarray(centred - (centred @ axis.direction)[:, None] * axis.direction)
 
 
-def _behind_the_front(axis: FittedAxis, across: Floats, ground: Ground) -> FittedAxis:
+def _behind_the_front(axis: FittedAxis, across: Floats, ground: Ground, sensor: Floats) -> FittedAxis:
     """The axis moved along the line of sight from the mean of the visible front to the pole's middle."""
     sign = 1.0 if axis.direction @ ground.normal > 0 else -1.0
     upwards = sign * axis.direction
-    sight = axis.mean - (axis.mean @ upwards) * upwards
+    sight = axis.mean - sensor
+    sight -= (sight @ upwards) * upwards
     sight /= max(float(np.linalg.norm(sight)), 1e-9)
     sideways = across @ np.cross(upwards, sight)
     depth = across @ sight

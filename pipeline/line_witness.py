@@ -100,6 +100,7 @@ def find_lines(
     rng: np.random.Generator,
     ground: Ground | None = None,
     structure: bool = False,
+    origin: Floats | None = None,
 ) -> LineFrame:
     """Finds lane lines and poles in the cloud, around the camera's view, and in the image.
 
@@ -118,6 +119,7 @@ def find_lines(
         rng: For the plane and the lines.
         ground: The ground plane of this very sweep where it was fitted before; else it is fitted here.
         structure: Edges of buildings, vehicles and furniture too.
+        origin: float64 (3,), where the sensor stands in the cloud's frame; None: it is found from the rings.
 
     Returns:
         The lines, and the reasons where there can be none.
@@ -127,17 +129,19 @@ def find_lines(
     seen = in_view(cloud, camera, T_cam_lidar)
     if ground is None:
         ground = fit_ground(cloud, up, rng)
+    if origin is None:
+        origin = sensor_origin(cloud)
     if ground is None:
         reasons.append("no ground plane in the cloud")
     else:
         if cloud.intensity is None:
             reasons.append("no lane lines in a cloud without intensity")
-        lanes = find_lanes(cloud, ground, seen, rng)
+        lanes = find_lanes(cloud, ground, seen, rng, origin=origin)
         lines += [with_arc(_along(line, forward), cloud) for line in lanes]
-        lines += find_poles(cloud, ground, seen)
+        lines += find_poles(cloud, ground, seen, origin=origin)
     image_lines = find_image_lines(image, masks, camera)
     if structure:
-        lines += cloud_lines(find_structure_lines(cloud, seen, rng, sensor_origin(cloud)))
+        lines += cloud_lines(find_structure_lines(cloud, seen, rng, origin))
         image_lines += find_image_segments(image, camera)
     aside = np.cross(up, forward)
     return LineFrame(tuple(lines), tuple(image_lines), tuple(reasons), aside / np.linalg.norm(aside))

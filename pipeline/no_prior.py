@@ -280,13 +280,15 @@ def _of_road(
 def _cloud_lines(road: _Road, rng: np.random.Generator) -> tuple[list[CloudLine], ...]:
     """Lines of the whole turn, and lanes of each half of it along the road: a bend parts them."""
     xyz, everywhere = road.cloud.xyz, np.ones(len(road.cloud), dtype=np.bool_)
-    lanes = find_lanes(road.cloud, road.ground, everywhere, rng)
-    poles = find_poles(road.cloud, road.ground, everywhere)
+    lanes = find_lanes(road.cloud, road.ground, everywhere, rng, origin=road.origin)
+    poles = find_poles(road.cloud, road.ground, everywhere, origin=road.origin)
     if not lanes:
         return ([*lanes, *poles],)
     longest = max(lanes, key=lambda line: float(np.linalg.norm(line.end - line.start)))
     along = xyz @ (longest.end - longest.start).astype(np.float32)
-    halves = [find_lanes(road.cloud, road.ground, half, rng) for half in (along > 0, along < 0)]
+    halves = [
+        find_lanes(road.cloud, road.ground, half, rng, origin=road.origin) for half in (along > 0, along < 0)
+    ]
     return ([*lanes, *poles], *halves)
 
 

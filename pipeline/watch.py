@@ -314,6 +314,7 @@ class Watch:
                 forward=mount.forward,
                 rng=rng,
                 ground=ground,
+                origin=self._origin,
             )
         self._line_frames.append((now_ns, lines))
         return masks, lines

@@ -56,6 +56,28 @@ def test_turning_the_lidar_turns_the_lines(seed):
         assert off_axis(line, *partner(line, ends)) < 0.08
 
 
+@pytest.mark.parametrize("numbered", [True, False])
+def test_a_cloud_told_in_the_vehicles_frame_shows_the_same_lanes(numbered):
+    cloud = weak(scenes.sampled_cloud(np.random.default_rng(10), noise=0.005), 10, noise=0.4, gain=0.25)
+    shift = np.array([-3.0, 0.7, 1.9])
+    ring = cloud.ring if numbered else None
+    cloud = PointCloud(cloud.xyz, cloud.intensity, ring)
+    moved = PointCloud((cloud.xyz + shift).astype(np.float32), cloud.intensity, ring)
+    every = np.ones(len(cloud), dtype=bool)
+    here = find_lanes(
+        cloud, fit_ground(cloud, scenes.UP, np.random.default_rng(1)), every, np.random.default_rng(2)
+    )
+    ground = fit_ground(moved, scenes.UP, np.random.default_rng(1))
+    there = find_lanes(moved, ground, every, np.random.default_rng(2), origin=shift)
+    assert len(here) == len(there) >= 3
+    for line in here:
+        near = min(there, key=lambda other: np.abs(other.start - line.start - shift).max())
+        assert np.abs(near.start - line.start - shift).max() < 0.1
+        assert np.abs(near.end - line.end - shift).max() < 0.1
+    # About the frame's own origin tracks are no longer those of beams, unless rings are numbered.
+    assert numbered or len(find_lanes(moved, ground, every, np.random.default_rng(2))) < len(here)
+
+
 def test_points_out_of_view_take_no_part():
     rng = np.random.default_rng(4)
     cloud = scenes.sampled_cloud(rng)

@@ -53,6 +53,23 @@ def test_poles_are_moved_from_their_front_to_their_axis():
         assert abs((line.start[:2] - [x, y]) @ sight) < 0.03
 
 
+def test_a_cloud_told_in_the_vehicles_frame_shows_the_same_poles():
+    cloud = scenes.sampled_cloud(np.random.default_rng(0))
+    shift = np.array([-3.0, 0.7, 1.9])
+    moved = PointCloud((cloud.xyz + shift).astype(np.float32), cloud.intensity)
+    every = np.ones(len(cloud), dtype=bool)
+    here = find_poles(cloud, fit_ground(cloud, scenes.UP, np.random.default_rng(1)), every)
+    ground = fit_ground(moved, scenes.UP, np.random.default_rng(1))
+    there = find_poles(moved, ground, every, origin=shift)
+    assert len(here) == len(there) == 4
+    for line in here:
+        near = min(there, key=lambda other: np.abs(other.start - line.start - shift).max())
+        assert np.abs(near.start - line.start - shift).max() < 1e-3
+        assert np.abs(near.end - line.end - shift).max() < 1e-3
+    # From the frame's own origin the sensor would seem to see higher than it does.
+    assert len(find_poles(moved, ground, every)) < 4
+
+
 def test_turning_the_lidar_turns_the_poles():
     rng = np.random.default_rng(2)
     turn = se3.exp_so3(np.array([0.4, -1.9, 0.8]))

@@ -35,6 +35,8 @@ class Degeneracy(IntEnum):
     """The third line is parallel to the lanes."""
     NO_ROOT = 5
     """No line of the pole's plane keeps the pole's angle to the lanes: the three do not belong together."""
+    NO_NUMBER = 6
+    """A normal, a direction or a point is not finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,10 +76,14 @@ def plane_normals(start: Floats, end: Floats, K: Floats) -> Floats:
 def p3l_candidates(
     n1: Floats, n2: Floats, n3: Floats, d_l: Floats, d_p: Floats, p1: Floats, p2: Floats, p3: Floats
 ) -> Candidates:
-    """All extrinsics that put two parallel lines and a third line into their planes (FORMULAS B (11), (12)).
+    """All extrinsics that put two parallel lines and a third line into their planes (CRLF (10), CRLF (13)).
+
+    The turn to the ground-parallel frame, ``R = R_CG R_GL`` there, is not made: the lines' directions are
+    taken as they lie in the LiDAR's frame.
 
     Args:
-        n1: float64 (M,3), unit, camera axes: normal of the plane of the first lane; signs are arbitrary.
+        n1: float64 (M,3), unit, camera axes: normal of the plane of the first lane; signs are arbitrary. Rows
+            with a number that is not finite, here or below, give nothing.
         n2: Likewise of the second lane.
         n3: Likewise of the pole.
         d_l: float64 (M,3), unit, LiDAR frame: direction of both lanes.
@@ -90,6 +96,10 @@ def p3l_candidates(
         Two signs of the lanes' direction times two roots of the pole's: four for each correspondence, or why
         there are none.
     """
+    given = (n1, n2, n3, d_l, d_p, p1, p2, p3)
+    finite = np.asarray(np.isfinite(np.hstack(given)).all(axis=1))
+    # What is not finite would warn on its way and then compare as sound.
+    n1, n2, n3, d_l, d_p, p1, p2, p3 = (np.where(finite[:, None], array, 0.0) for array in given)
     a0 = np.cross(n1, n2)
     width = np.linalg.norm(a0, axis=1)
     a = a0 / np.maximum(width, _NO_SINE)[:, None]
@@ -100,6 +110,7 @@ def p3l_candidates(
     across = np.linalg.norm(np.cross(d_l, d_p), axis=1)
     degeneracy = np.select(
         [
+            ~finite,
             width < _NO_SINE,
             across < _NO_SINE,
             np.abs(ahead) < _NO_SINE,
@@ -107,6 +118,7 @@ def p3l_candidates(
             np.abs(ratio) > _ROOT_SLACK,
         ],
         [
+            Degeneracy.NO_NUMBER,
             Degeneracy.LANES_IN_ONE_PLANE,
             Degeneracy.POLE_ALONG_LANES,
             Degeneracy.POLE_DEAD_AHEAD,
@@ -126,7 +138,10 @@ def p3l_candidates(
 
 
 def _rotations(a: Floats, n3: Floats, ratio: Floats, d_l: Floats, d_p: Floats) -> Floats:
-    """The four rotations (M,4,3,3) that turn both directions into their planes (steps 1 to 3)."""
+    """The four rotations (M,4,3,3) that turn both directions into their planes.
+
+    CRLF (11), generalised to a pole at any angle to the lanes: steps 1 to 3 of FORMULAS B (11).
+    """
     # Roots: (+a, +psi), (+a, -psi), (-a, +psi), (-a, -psi).
     lane = a[:, None] * np.array([1.0, 1.0, -1.0, -1.0])[:, None]
     normal = np.broadcast_to(n3[:, None], lane.shape)
@@ -142,7 +157,7 @@ def _rotations(a: Floats, n3: Floats, ratio: Floats, d_l: Floats, d_p: Floats) -
 
 
 def _translations(N: Floats, R: Floats, points: Floats) -> Floats:
-    """Shifts (M,4,3) of ``n_i . t = -n_i . (R p_i)`` for normals and points (M,3,3), and R (M,4,3,3)."""
+    """CRLF (12): shifts (M,4,3) of ``n_i . t = -n_i . (R p_i)``; normals and points (M,3,3), R (M,4,3,3)."""
     right = -np.einsum("mic,mkcl,mil->mki", N, R, points, optimize=True)
     return np.asarray(np.linalg.solve(N[:, None], right[..., None])[..., 0])
 

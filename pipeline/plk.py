@@ -37,8 +37,11 @@ _NO_FREEDOM = 1e-6
 _BY_CHANCE = 1e-3
 """Chance that planes with a common ray seem to have none; their answer is then judged by its cost alone."""
 
+_ROUNDING_PX = 1e-6
+"""px; no end distance is known better: it makes the weights of noiseless lines finite."""
+
 _MAX_DAMPING = 1e6
-"""Likewise: a step so small that does not lower the cost is rounding."""
+"""Times the largest curvature: a step so small that does not lower the cost is rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +122,11 @@ def select(pairs: LinePairs, chosen: NDArray[np.bool_]) -> LinePairs:
     )
 
 
+def whitening(pairs: LinePairs) -> Floats:
+    """Matrices W (N,2,2), 1/px, that give end distances unit covariance: ``W S_n W^T = I``."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(pairs.covariance + _ROUNDING_PX**2 * np.eye(2))))
+
+
 def line_matrix(K: Floats) -> Floats:
     """K_line = det(K) K^-T, which maps plane normals to image lines (PLK (3))."""
     return np.asarray(np.linalg.det(K) * np.linalg.inv(K).T)
@@ -183,6 +191,9 @@ def plane_normals(pairs: LinePairs, K: Floats) -> Floats:
 def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
     """PLK-Calib method II: rotation from directions, then translation linearly (FORMULAS C (10)-(14), C7).
 
+    Both stages ask that the line in the camera's axes, PLK (8), lies in the plane of its image, PLK (9): its
+    direction for the rotation, its distance from the camera for the translation.
+
     Stage 1 minimises the weighted sines ``n'^T R v``; stage 2 solves ``n'.t = -n'.(R p_m)``, the scalar form,
     since the printed matrix form is biased.
 
@@ -206,6 +217,7 @@ def method_two(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
 def rotation_from_directions(pairs: LinePairs, K: Floats, T_start: Floats) -> Floats | None:
     """Stage 1 of method II: rotation (3,3) by the weighted sines ``n'^T R v`` (FORMULAS C (10)-(13), C7).
 
+    The sine is PLK (10) and PLK (11), their sum of squares PLK (12), its derivative PLK (13), corrected.
     None where the directions leave a freedom: parallel lines, or fewer than three.
     """
     normal = plane_normals(pairs, K)
@@ -230,8 +242,9 @@ def rotation_from_directions(pairs: LinePairs, K: Floats, T_start: Floats) -> Fl
 
 
 def translation_from_planes(pairs: LinePairs, K: Floats, R: Floats, T_start: Floats) -> Floats | None:
-    """Stage 2 of method II: translation (3,) by ``n'.t = -n'.(R p_m)`` (FORMULAS C (14), scalar form).
+    """Stage 2 of method II: translation (3,) by ``n'.t = -n'.(R p_m)``, PLK (14) in its scalar form.
 
+    The printed matrix form is biased (FORMULAS C (14)).
     The weights are taken at ``T_start``. None where the planes leave a freedom: all share a ray, as far as
     the noise of the image tells.
     """
@@ -256,7 +269,7 @@ def _share_a_ray(pairs: LinePairs, K: Floats, ray: Floats) -> bool:
     # The distance is the triple product (first, last, seen) but for a factor that divides out.
     distance = np.cross(first, last) @ seen
     slopes = np.concatenate([np.cross(last, seen)[:, :2], np.cross(seen, first)[:, :2]], axis=1)
-    variance = np.trace(pairs.covariance, axis1=1, axis2=2) / 2 * (slopes**2).sum(axis=1)
+    variance = _variance(pairs) * (slopes**2).sum(axis=1)
     statistic = float((distance**2 / np.maximum(variance, 1e-300)).sum())
     return statistic <= float(chdtri(len(pairs) - 2, _BY_CHANCE))
 
@@ -269,8 +282,13 @@ def _stage_sigmas(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> tuple[Flo
     # Only the weights: a depth that the start puts behind the camera counts as near.
     depth = np.hypot(np.maximum(pairs.start @ R + t, 0.1), np.maximum(pairs.end @ R + t, 0.1))
     length = np.linalg.norm(pairs.end - pairs.start, axis=1)
-    sigma_px = np.sqrt(np.trace(pairs.covariance, axis1=1, axis2=2) / 2)
+    sigma_px = np.sqrt(_variance(pairs))
     return sigma_px * depth / (kappa * length), sigma_px * depth / (2 * kappa)
+
+
+def _variance(pairs: LinePairs) -> Floats:
+    """Mean variance (N,) of the two ends of each line, px^2."""
+    return np.asarray(np.trace(pairs.covariance, axis1=1, axis2=2) / 2 + _ROUNDING_PX**2)
 
 
 def line_sensitivity(n_cam: Floats, K: Floats) -> Floats:
@@ -291,10 +309,10 @@ class _Normal:
     distances: Floats
 
 
-def _linearise(pairs: LinePairs, whitening: Floats, K: Floats, T_cam_lidar: Floats) -> _Normal:
+def _linearise(pairs: LinePairs, white: Floats, K: Floats, T_cam_lidar: Floats) -> _Normal:
     """Robust cost (PLK (5), squared and weighted), information and gradient (FORMULAS D2)."""
-    r = np.einsum("nij,nj->ni", whitening, residuals(pairs, K, T_cam_lidar))
-    J = whitening @ jacobians(pairs, K, T_cam_lidar)
+    r = np.einsum("nij,nj->ni", white, residuals(pairs, K, T_cam_lidar))
+    J = white @ jacobians(pairs, K, T_cam_lidar)
     distance = np.hypot(r[:, 0], r[:, 1])
     weight = np.minimum(1.0, HUBER / np.maximum(distance, 1e-12))
     cost = np.where(distance <= HUBER, 0.5 * distance**2, HUBER * (distance - 0.5 * HUBER)).sum()
@@ -318,10 +336,10 @@ def method_one(
     Returns:
         The extrinsic with the information of the lines alone.
     """
-    whitening = np.linalg.inv(np.linalg.cholesky(pairs.covariance))
+    white = whitening(pairs)
 
     def total(T: Floats) -> tuple[_Normal, float, Floats, Floats]:
-        lines = _linearise(pairs, whitening, K, T)
+        lines = _linearise(pairs, white, K, T)
         if prior is None:
             return lines, lines.cost, lines.information, lines.gradient
         xi = se3.local(prior.T_cam_lidar, T)

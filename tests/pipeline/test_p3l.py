@@ -235,3 +235,17 @@ def test_normals_hold_the_line_and_ignore_its_scale():
         rays = np.column_stack([uv, np.ones(50)]) @ np.linalg.inv(K).T
         assert np.abs((rays * n).sum(axis=1)).max() < 1e-12
     np.testing.assert_array_equal(plane_normals(start[:1], start[:1], K), np.zeros((1, 3)))
+
+
+def test_rows_with_a_number_missing_are_named_and_the_others_solved():
+    rng = np.random.default_rng(8)
+    truth, start, end = setups(rng, 9, lean=1.0)
+    d = unit(end - start)
+    given_ = [*seen_planes(truth, start, end, rng), d[:, 0], d[:, 2], start[:, 0], start[:, 1], start[:, 2]]
+    given_ = [array.copy() for array in given_]
+    for k, array in enumerate(given_):
+        array[k, k % 3] = (np.nan, np.inf)[k % 2]
+    found = p3l_candidates(*given_)
+    assert found.degeneracy.tolist() == [Degeneracy.NO_NUMBER] * 8 + [Degeneracy.NONE]
+    assert np.isfinite(found.T_cam_lidar).all()
+    assert np.abs(found.T_cam_lidar[8] - truth[8]).max(axis=(1, 2)).min() < 1e-9

@@ -199,3 +199,16 @@ def test_line_sensitivity_predicts_the_shift_of_a_projected_line():
     moved = plk.LinePairs(pairs.start, pairs.end, uv[:, :2] / uv[:, 2:], pairs.image_end, pairs.covariance)
     distance = np.abs(plk.residuals(moved, scenes.K, scenes.TRUTH))[:, 0]
     np.testing.assert_allclose(distance, 1e-5 * kappa / (start + shift)[:, 2], rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["a", "c", "e"])
+def test_lines_that_claim_no_noise_at_all_give_the_truth(name):
+    """Covariances of zero have no inverse; parallel lines (c) leave only the shift along them."""
+    pairs = scenes.observed(scenes.scene(name), 0.0, np.random.default_rng(1))
+    pairs = plk.LinePairs(
+        pairs.start, pairs.end, pairs.image_start, pairs.image_end, np.zeros_like(pairs.covariance)
+    )
+    found = plk.method_one(pairs, scenes.K, scenes.start_off(np.ones(6)))
+    assert np.isfinite(found.information).all()
+    assert se3.rotation_angle(found.T_cam_lidar[:3, :3], scenes.TRUTH[:3, :3]) < 1e-6
+    assert np.abs(plk.residuals(pairs, scenes.K, found.T_cam_lidar)).max() < 1e-4

@@ -106,7 +106,7 @@ def coarse_extrinsic(
     up: Floats | None = None,
     parameters: CoarseParameters | None = None,
 ) -> CoarseSolution | NoCoarse:
-    """Finds the extrinsic from one frame's lines without a prior (CRLF III-C, FORMULAS B (11), (12)).
+    """Finds the extrinsic from one frame's lines without a prior (CRLF III-C; CRLF (10)-(13) in ``p3l``).
 
     Args:
         cloud_lines: Lanes and poles, LiDAR frame; ends in any order. Other classes take no part.
@@ -115,7 +115,8 @@ def coarse_extrinsic(
         maps: Plateau maps of the raw image's masks.
         camera: Intrinsics.
         up: float64 (3,), LiDAR frame, where up is, to some 45 deg; None: poles stand on the lanes' plane and
-            tell it, and where one does not, both signs of the ground's normal are tried.
+            tell it, and where one does not, both signs of the ground's normal are tried. A vector that is
+            no direction gives no extrinsic.
         parameters: What takes part; None: the defaults.
 
     Returns:
@@ -262,8 +263,8 @@ def _drawn_in(fit: _Fit, frame: _Frame) -> _Fit:
     if len(pairs) == 0:
         return fit
     prior = plk.Prior(T, np.diag(_WIDEST**-2.0))
-    J = plk.jacobians(pairs, K, T)
-    information = np.einsum("nki,nkj->ij", J, np.linalg.solve(pairs.covariance, J))
+    J = plk.whitening(pairs) @ plk.jacobians(pairs, K, T)
+    information = np.einsum("nki,nkj->ij", J, J)
     posterior = np.linalg.inv(information + prior.precision)
     covariance = np.asarray(posterior + np.diag(_FLOOR**2), dtype=np.float64)
     wider = associate(frame.cloud, frame.image, frame.camera, T, covariance)

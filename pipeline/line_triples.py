@@ -7,6 +7,7 @@ camera, in front of the lines and above the road, may have (FORMULAS B (12), 4).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -31,11 +32,9 @@ NoTriplesReason: TypeAlias = Literal[
     "the image's lanes lie in one plane with the camera",
     "every pole stands dead ahead or in line with the lanes",
     "no correspondence puts the lines in front of an upright camera above the road",
+    "up is no direction",
 ]
 """Why no correspondence is left."""
-
-Reason: TypeAlias = NoTriplesReason | Literal["no candidate meets the masks"]
-"""Why a scene gives no coarse extrinsic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +45,8 @@ class TripleParameters:
         image_lanes: The longest lanes of the image; CRLF takes 2.
         image_poles: Likewise; CRLF takes 1. The longest may be missing in the cloud, all three seldom are.
         cloud_lanes: The longest lanes of the cloud; six bound two carriageways.
-        cloud_poles: Poles of the cloud with the largest angle in height; a full turn shows as many behind.
-            With the three above 6480 correspondences at most, some 0.1 s.
+        cloud_poles: Poles of the cloud, the longest and those with the largest angle in height; a full turn
+            shows as many behind. With the three above 6480 correspondences at most, some 0.1 s.
         parallel: rad; lanes that enclose more do not belong to one straight road.
         apart_m: m; lanes nearer to each other are one line twice, or a doubled one.
         least_sine: Of the angle between the planes of two image lanes, and between a pole's plane and the
@@ -100,28 +99,29 @@ class Lines:
 def largest_lines(
     cloud_lines: Sequence[CloudLine], image_lines: Sequence[ImageLine], p: TripleParameters
 ) -> Lines:
-    """The largest lines of each kind. The longer a line, the better its direction is known.
+    """The largest lines of each kind. The longer a line, the better its direction is known."""
+    return Lines(
+        longest_lines(image_lines, "lane", p.image_lanes),
+        longest_lines(image_lines, "pole", p.image_poles),
+        longest_lines(cloud_lines, "lane", p.cloud_lanes),
+        largest_poles(cloud_lines, p.cloud_poles),
+    )
 
-    A cloud pole counts by its angle in height from the LiDAR: near ones fix the place along the road.
+
+def largest_poles(lines: Sequence[CloudLine], most: int) -> list[CloudLine]:
+    """Poles of a cloud, in turn the longest and the one with the largest angle in height that are left.
+
+    Near ones fix the place along the road and are the long ones of the image; but what stands beside the
+    LiDAR and is no pole, a post or a person, has a large angle too and would fill all places.
     """
 
-    def image(label: LineLabel, most: int) -> list[ImageLine]:
-        return longest_lines(image_lines, label, most)
+    def angle(line: CloudLine) -> float:
+        return _length(line) / max(float(np.linalg.norm(line.start + line.end)) / 2, 1.0)
 
-    def cloud(label: LineLabel, most: int, *, by_angle: bool) -> list[CloudLine]:
-        def size(line: CloudLine) -> float:
-            reach = float(np.linalg.norm(line.start + line.end)) / 2
-            return _length(line) / max(reach, 1.0) if by_angle else _length(line)
-
-        usable = [line for line in cloud_lines if line.label == label and is_usable(line)]
-        return sorted(usable, key=size, reverse=True)[:most]
-
-    return Lines(
-        image("lane", p.image_lanes),
-        image("pole", p.image_poles),
-        cloud("lane", p.cloud_lanes, by_angle=False),
-        cloud("pole", p.cloud_poles, by_angle=True),
-    )
+    by_length = longest_lines(lines, "pole", None)
+    by_angle = sorted(by_length, key=angle, reverse=True)
+    in_turn = chain.from_iterable(zip(by_length, by_angle, strict=True))
+    return list({id(line): line for line in in_turn}.values())[:most]
 
 
 def longest_lines(lines: Sequence[_L], label: LineLabel, most: int | None) -> list[_L]:
@@ -170,7 +170,7 @@ def enumerate_triples(
     Returns:
         The roots, or the step at which none was left.
     """
-    reason = lines.missing()
+    reason = lines.missing() or _misleading(up)
     if reason is not None:
         return NoTriples(reason)
     lane_n, pole_n = (
@@ -213,6 +213,13 @@ def enumerate_triples(
         return NoTriples("no correspondence puts the lines in front of an upright camera above the road")
     which = np.nonzero(seen)[0]
     return Triples(roots.T_cam_lidar[seen], cloud[which], image[which])
+
+
+def _misleading(up: Floats | None) -> NoTriplesReason | None:
+    """Why a vector can not tell where up is."""
+    if up is None or 0.0 < float(np.linalg.norm(up)) < OUTERMOST:
+        return None
+    return "up is no direction"
 
 
 def _solvable(
@@ -274,12 +281,20 @@ def _believable(
     seen &= p3l.in_front(T[:, :, None], poles[:, None]).all(axis=2)
     upwards = (told >= 0)[:, None] & _stands(T, poles, first, normal)
     seen &= upwards | ((told <= 0)[:, None] & _stands(T, poles, first, -normal))
-    lane_ends = np.stack([np.stack([line.start, line.end]) for line in lines.cloud_lanes])
-    for k in (0, 1):
-        # A lane may begin beside or behind the camera: a full turn of the LiDAR sees it all.
-        seen &= p3l.in_front(T[:, :, None], lane_ends[cloud[:, k]][:, None]).any(axis=2)
-    drawn = np.stack([np.stack([line.start, line.end]) for line in lines.image_poles])[image[:, 2]]
-    return np.asarray(seen & _overlap(T, poles, drawn, camera, seen))
+    ends = [np.stack([_ends(line) for line in kind]) for kind in (lines.cloud_lanes, lines.cloud_poles)]
+    drawn = [np.stack([_ends(line) for line in kind]) for kind in (lines.image_lanes, lines.image_poles)]
+    for k, kind in enumerate((0, 0, 1)):
+        # Few are left from step to step.
+        row, root = np.nonzero(seen)
+        seen[row, root] = _overlap(
+            T[row, root], ends[kind][cloud[row, k]], drawn[kind][image[row, k]], camera.K
+        )
+    return np.asarray(seen)
+
+
+def _ends(line: CloudLine | ImageLine) -> Floats:
+    """Start and end of a line, (2,3) or (2,2)."""
+    return np.stack([line.start, line.end])
 
 
 def _stands(T: Floats, poles: Floats, ground: Floats, up: Floats) -> Bools:
@@ -289,19 +304,21 @@ def _stands(T: Floats, poles: Floats, ground: Floats, up: Floats) -> Bools:
     return np.asarray(p3l.upright(T, foot, top) & p3l.above(T, ground[:, None], up[:, None]))
 
 
-def _overlap(T: Floats, ends: Floats, drawn: Floats, camera: CameraModel, seen: Bools) -> Bools:
-    """Whether projections of segments (M,2,3) have a part in common with image segments (M,2,2): (M,4).
+def _overlap(T: Floats, ends: Floats, drawn: Floats, K: Floats) -> Bools:
+    """Whether segments (S,2,3) project, by extrinsics (S,4,4), onto a part of image segments (S,2,2): (S,).
 
-    Both lie on one line, which is how the roots were made.
+    Both lie on one line, which is how the roots were made. Of a segment that runs on behind the camera, as
+    lanes do where a LiDAR turns fully, the part in front counts; one without such a part projects nowhere.
     """
+    cam = np.einsum("sij,skj->ski", T[:, :3, :3], ends) + T[:, None, :3, 3]
+    depth = cam[..., 2]
+    near = depth < p3l.NEAREST_M
+    rise = np.where(near[:, 0] != near[:, 1], depth[:, 1] - depth[:, 0], 1.0)
+    cut = cam[:, 0] + ((p3l.NEAREST_M - depth[:, 0]) / rise)[:, None] * (cam[:, 1] - cam[:, 0])
+    uvw = np.where(near[..., None], cut[:, None], cam) @ K.T
+    shown = ~near.all(axis=1)
+    uv = uvw[..., :2] / np.where(shown[:, None], uvw[..., 2], 1.0)[..., None]
     along = drawn[:, 1] - drawn[:, 0]
-    squared = np.einsum("mi,mi->m", along, along)
-    share = []
-    for point in (ends[:, 0], ends[:, 1]):
-        cam = np.einsum("mkij,mj->mki", T[..., :3, :3], point) + T[..., :3, 3]
-        uv = cam @ camera.K.T
-        uv = uv[..., :2] / np.where(seen, uv[..., 2], 1.0)[..., None]
-        share.append(np.einsum("mki,mi->mk", uv - drawn[:, None, 0], along) / squared[:, None])
-    low, high = np.minimum(*share), np.maximum(*share)
-    common = np.minimum(high, 1.0) - np.maximum(low, 0.0)
-    return np.asarray(common > 0.0)
+    share = np.einsum("ski,si->sk", uv - drawn[:, :1], along) / np.einsum("si,si->s", along, along)[:, None]
+    common = np.minimum(share.max(axis=1), 1.0) - np.maximum(share.min(axis=1), 0.0)
+    return np.asarray(shown & (common > 0.0))

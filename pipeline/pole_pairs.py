@@ -13,7 +13,7 @@ import numpy as np
 from pipeline import p3l
 from pipeline.errors import InputError
 from pipeline.ground import Ground
-from pipeline.line_triples import longest_lines
+from pipeline.line_triples import largest_poles, longest_lines
 from pipeline.records import CameraModel, CloudLine, Floats, ImageLine
 
 
@@ -24,7 +24,8 @@ class PolePairParameters:
     Attributes:
         image_poles: The longest poles of the image.
         image_lanes: The longest lanes of the image.
-        cloud_poles: Poles of the cloud with the largest angle in height: near ones tell the place best.
+        cloud_poles: Poles of the cloud, the longest and those with the largest angle in height: near ones
+            tell the place best.
         cloud_lanes: The longest lanes of the cloud.
         apart_m: m; poles nearer to each other tell no direction between them.
         least_sine: Of the angle between the planes of two image poles, and between a lane's plane and the
@@ -73,7 +74,7 @@ def pole_pair_extrinsics(
     p = parameters or PolePairParameters()
     image_poles = longest_lines(image_lines, "pole", p.image_poles)
     image_lanes = longest_lines(image_lines, "lane", p.image_lanes)
-    cloud_poles = _nearest(longest_lines(cloud_lines, "pole", None), p.cloud_poles)
+    cloud_poles = largest_poles(cloud_lines, p.cloud_poles)
     cloud_lanes = longest_lines(cloud_lines, "lane", p.cloud_lanes)
     if min(len(image_poles), len(cloud_poles)) < _TWO or not image_lanes or not cloud_lanes:
         return np.zeros((0, 4, 4))
@@ -105,16 +106,6 @@ def pole_pair_extrinsics(
 
 _TWO = 2
 """Poles that a pair has."""
-
-
-def _nearest(poles: list[CloudLine], most: int) -> list[CloudLine]:
-    """The poles with the largest angle in height from the LiDAR."""
-
-    def angle(line: CloudLine) -> float:
-        reach = 0.5 * float(np.linalg.norm(line.start + line.end))
-        return float(np.linalg.norm(line.end - line.start)) / max(reach, 1.0)
-
-    return sorted(poles, key=angle, reverse=True)[:most]
 
 
 def _normals(lines: Sequence[ImageLine], camera: CameraModel) -> Floats:

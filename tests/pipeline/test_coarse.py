@@ -328,3 +328,15 @@ def test_a_thousand_lines_are_bounded(scene):
 def test_parameters_that_leave_no_triple_are_refused(bad):
     with pytest.raises(InputError, match="below"):
         bad()
+
+
+def test_lines_that_claim_no_noise_at_all_are_solved():
+    """sigma 0, as a drawn map or a simulation gives: the weights stay finite."""
+    made = make(3, sigma_px=0.0, sigma_m=0.0)
+    cloud = [dataclasses.replace(line, sigma_m=0.0) for line in made.cloud]
+    image = [dataclasses.replace(line, sigma_px=0.0) for line in made.image]
+    found = made.solve(cloud=cloud, image=image)
+    assert isinstance(found, CoarseSolution)
+    angle, shift = made.errors(found)
+    assert angle < 0.01
+    assert shift < 0.005

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.cameras import ideal_pixels
+from pipeline.medians import median
 from pipeline.records import CameraImage, CameraModel, Floats, ImageLine, LineLabel, Masks
 
 REFERENCE_FOCAL_PX = 720.0
@@ -147,7 +148,8 @@ def _segments(
         return []
     ends = found.reshape(-1, 2, 2).astype(np.float64)
     ends = ends[np.argsort(-np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))]
-    pixels = np.argwhere(core > 0)[:, ::-1].astype(np.float64)
+    row, column = np.nonzero(core)
+    pixels = np.stack([column, row]).astype(np.float64)
     half_width = cv2.dilate(depth, np.ones((3, 3)))
     claimed = np.zeros(core.shape, dtype=np.uint8)
     segments = []
@@ -180,30 +182,32 @@ _CORRIDOR_PX = 2.0
 def _between(start: Floats, end: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Columns and rows of the grid px from start to end."""
     count = max(2, round(float(np.abs(end - start).max())) + 1)
-    column, row = np.rint(np.linspace(start, end, count)).astype(np.int64).T
+    share = np.arange(count) / (count - 1)
+    column, row = (np.rint(a + share * (b - a)).astype(np.int64) for a, b in zip(start, end, strict=True))
     return column, row
 
 
 def _settled(pixels: Floats, rough: Floats, gap: float) -> tuple[Floats, Floats]:
-    """A Hough segment (2,2) turned onto the core's px (N,2) around it and prolonged as far as they go on."""
+    """A Hough segment (2,2) turned onto the core's px (2,N) around it and prolonged as far as they go on."""
     start, end = rough
     for _ in range(3):
-        length = max(float(np.linalg.norm(end - start)), 1.0)
+        length = max(math.dist(start, end), 1.0)
         direction = (end - start) / length
-        offset = pixels - start
-        near = np.abs(offset @ np.array([-direction[1], direction[0]])) <= _CORRIDOR_PX
-        members, along = pixels[near], offset[near] @ direction
+        x, y = pixels[0] - start[0], pixels[1] - start[1]
+        near = np.flatnonzero(np.abs(y * direction[0] - x * direction[1]) <= _CORRIDOR_PX)
+        along = x[near] * direction[0] + y[near] * direction[1]
         order = np.argsort(along)
-        members, along = members[order], along[order]
+        along = along[order]
         runs = np.concatenate([[0], np.flatnonzero(np.diff(along) > gap) + 1, [len(along)]])
         middle = int(np.searchsorted(runs, np.searchsorted(along, length / 2), side="right"))
-        run = members[runs[max(middle, 1) - 1] : runs[max(middle, 1)]]
-        if len(run) < _LEAST_VOTES:
+        run = pixels[:, near[order[runs[max(middle, 1) - 1] : runs[max(middle, 1)]]]]
+        if run.shape[1] < _LEAST_VOTES:
             break
-        mean = run.mean(axis=0)
-        axis = _principal(run - mean)
+        mean = run.sum(axis=1) / run.shape[1]
+        centred = run.T - mean
+        axis = _principal(centred)
         axis = axis if axis @ direction > 0 else -axis
-        along = (run - mean) @ axis
+        along = centred @ axis
         start, end = mean + along.min() * axis, mean + along.max() * axis
     return start, end
 
@@ -240,15 +244,16 @@ def _centres(
     offset = np.arange(-reach, reach + SAMPLE_PX / 2, SAMPLE_PX)
     where = (station[:, None, :] + offset[None, :, None] * normal).astype(np.float32)
     profile = cv2.remap(grey, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    slope = np.gradient(profile.astype(np.float64), SAMPLE_PX, axis=1)
-    floor = np.maximum(MIN_EDGE, EDGE_OVER_MEDIAN * np.median(np.abs(slope), axis=1))
+    slope = _slope(profile.astype(np.float64))
+    steepness = np.abs(slope)
+    floor = np.maximum(MIN_EDGE, EDGE_OVER_MEDIAN * _row_medians(steepness))
     edges = []
     for side in (-1.0, 1.0):
         window = np.abs(offset[None, :] - side * 0.5 * width[:, None]) <= margin[:, None]
         # Each side stays on its own half, or both find the same edge of a thin stroke.
         window &= side * offset[None, :] > -0.5 * margin[:, None]
         # Paint is brighter than the road; what stands behind a pole changes along it.
-        signed = np.abs(slope) if label == "pole" else -side * slope
+        signed = steepness if label == "pole" else -side * slope
         edges.append(_peak(signed, window, offset, floor))
     left, right = edges
     both = np.isfinite(left) & np.isfinite(right)
@@ -257,6 +262,23 @@ def _centres(
         return np.zeros((0, 2))
     middle = 0.5 * (left[both] + right[both])
     return np.asarray(station[both] + middle[:, None] * normal)
+
+
+def _slope(profile: Floats) -> Floats:
+    """Change (M,K) of grey per px along each cross-section (M,K) of samples ``SAMPLE_PX`` apart."""
+    slope = np.empty_like(profile)
+    slope[:, 1:-1] = (profile[:, 2:] - profile[:, :-2]) / (2.0 * SAMPLE_PX)
+    slope[:, 0] = (profile[:, 1] - profile[:, 0]) / SAMPLE_PX
+    slope[:, -1] = (profile[:, -1] - profile[:, -2]) / SAMPLE_PX
+    return slope
+
+
+def _row_medians(values: Floats) -> Floats:
+    """Median (M,) of each row (M,K), finite."""
+    half = values.shape[1] // 2
+    low = half - 1 + values.shape[1] % 2
+    parted = np.partition(values, (low, half), axis=1)
+    return np.asarray(0.5 * (parted[:, low] + parted[:, half]))
 
 
 def _peak(signed: Floats, window: NDArray[np.bool_], offset: Floats, floor: Floats) -> Floats:
@@ -281,27 +303,34 @@ def _straight(points: Floats, unit: float) -> list[_Stroke]:
     across = (stroke.points - stroke.mean) @ np.array([-stroke.direction[1], stroke.direction[0]])
     half = 0.5 * float(np.ptp(along))
     middle = 0.5 * float(along.min() + along.max())
-    bend = np.polynomial.polynomial.polyfit((along - middle) / half, across, 2)[2]
-    if abs(bend) > MAX_SAG_PX * unit:
+    if abs(_sag((along - middle) / half, across)) > MAX_SAG_PX * unit:
         position = (points - stroke.mean) @ stroke.direction
         return _straight(points[position < middle], unit) + _straight(points[position >= middle], unit)
     return [stroke] if stroke.rms <= MAX_RMS_PX * unit else []
 
 
+def _sag(place: Floats, across: Floats) -> float:
+    """Coefficient of the square in the parabola of least squares through ``across`` (N,) at -1..1 (N,)."""
+    rows = np.stack([np.ones(len(place)), place, place * place])
+    return float(np.linalg.lstsq(rows @ rows.T, rows @ across, rcond=None)[0][2])
+
+
 def _fit(points: Floats, unit: float) -> _Stroke | None:
     """Total least squares with trimming; None for too few points."""
-    kept = np.ones(len(points), dtype=bool)
+    kept = np.arange(len(points))
     stroke = None
     for _ in range(4):
-        if kept.sum() < MIN_STATIONS:
+        if len(kept) < MIN_STATIONS:
             return None
-        mean = points[kept].mean(axis=0)
-        direction = _principal(points[kept] - mean)
+        own = points[kept]
+        mean = own.sum(axis=0) / len(own)
+        direction = _principal(own - mean)
         across = np.abs((points - mean) @ np.array([-direction[1], direction[0]]))
-        rms = float(np.sqrt((across[kept] ** 2).mean()))
-        stroke = _Stroke(points[kept], mean, direction, rms)
-        scale = 1.48 * float(np.median(across[kept]))
-        kept = across <= TRIM_SIGMAS * max(scale, 0.1 * unit)
+        near = across[kept]
+        stroke = _Stroke(own, mean, direction, math.sqrt(float(near @ near) / len(near)))
+        before, kept = kept, np.flatnonzero(across <= TRIM_SIGMAS * max(1.48 * median(near), 0.1 * unit))
+        if np.array_equal(before, kept):
+            break
     return stroke
 
 
@@ -333,14 +362,15 @@ def _joint(first: _Stroke, second: _Stroke, unit: float) -> _Stroke | None:
     if abs(across) > 4.0 * FLOOR_PX * unit + 0.1 * abs(along):
         return None
     points = np.concatenate([first.points, second.points])
-    mean = points.mean(axis=0)
+    mean = points.sum(axis=0) / len(points)
     direction = _principal(points - mean)
     across = (points - mean) @ np.array([-direction[1], direction[0]])
-    offsets = [abs(float(part.mean())) for part in np.split(across, [len(first.points)])]
-    rms = float(np.sqrt((across**2).mean()))
+    own = len(first.points)
+    offset = max(abs(float(part.sum())) / len(part) for part in (across[:own], across[own:]))
+    rms = math.sqrt(float(across @ across) / len(across))
     apart = max(first.rms, second.rms, FLOOR_PX * unit)
     joint = _Stroke(points, mean, direction, rms)
-    fits = rms <= 1.2 * apart and max(offsets) <= apart and len(_straight(points, unit)) == 1
+    fits = rms <= 1.2 * apart and offset <= apart and len(_straight(points, unit)) == 1
     return joint if fits else None
 
 

@@ -43,8 +43,6 @@ TRIM_PX = 1.0
 """px; a point further from the median line of its piece belongs to something that crosses it."""
 MAX_RMS_PX = 0.8
 """px; straight edges scatter by 0.1 to 0.4 px, leaves by more."""
-_ROUNDS = 4
-"""Rounds of merging: each at least doubles the pieces of a line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,7 +235,8 @@ def merge_candidates(ends: Floats, gap: float) -> NDArray[np.int64]:
 
 def merge(pieces: _Pieces, unit: float) -> _Pieces:
     """Joins pieces of one line until nothing changes; what no one straight line explains stays apart."""
-    for _ in range(_ROUNDS):
+    # Each round has a piece less at least, and about half as many of a chain of pieces.
+    while True:
         pairs = merge_candidates(pieces.ends, MERGE_GAP_PX * unit)
         joint, straight = _joined(pieces, pairs, unit)
         pairs, joint = pairs[straight], joint.take(straight)
@@ -251,7 +250,7 @@ def merge(pieces: _Pieces, unit: float) -> _Pieces:
                 free[i] = free[j] = False
                 chosen.append(k)
         if not chosen:
-            break
+            return pieces
         new, old = joint.take(np.array(chosen, dtype=np.int64)), pieces.take(free)
         pieces = _Pieces(
             np.concatenate([new.ends, old.ends]),
@@ -259,7 +258,6 @@ def merge(pieces: _Pieces, unit: float) -> _Pieces:
             np.concatenate([new.mean, old.mean]),
             np.concatenate([new.scatter, old.scatter]),
         )
-    return pieces
 
 
 def _joined(pieces: _Pieces, pairs: NDArray[np.int64], unit: float) -> tuple[_Pieces, NDArray[np.bool_]]:

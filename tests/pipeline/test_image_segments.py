@@ -14,6 +14,7 @@ from pipeline.image_segments import (
     MIN_LENGTH_PX,
     find_image_segments,
     merge_candidates,
+    segments_to_lines,
     shrunk,
 )
 from pipeline.records import CameraImage, CameraModel
@@ -107,6 +108,20 @@ def test_pieces_of_one_edge_are_one_line():
     lines = find_image_segments(drawn([(body, 180), (wire, 90)], cam), cam)
     _, covered = off(lines[0], body[0], body[1])
     assert max(covered, off(lines[1], body[0], body[1])[1]) > 0.9
+
+
+@pytest.mark.parametrize("count", [17, 40])
+def test_many_pieces_of_one_edge_are_one_line(count):
+    """A fence before a kerb cuts it every 12 px: joined two by two until one is left."""
+    cam = camera()
+    grey = drawn([([(10.0, 180.2), (630.0, 180.2), (630.0, 350.0), (10.0, 350.0)], 180)], cam).pixels[:, :, 0]
+    left = 20.0 + 12.0 * np.arange(count)
+    pieces = np.stack([np.column_stack([left + at, np.full(count, 180.0)]) for at in (0.0, 11.0)], axis=1)
+    lines = segments_to_lines(pieces, grey, 1, cam)
+    assert len(lines) == 1
+    error, covered = off(lines[0], np.array([20.0, 180.2]), np.array([left[-1] + 11.0, 180.2]))
+    assert np.abs(error).max() < 0.7
+    assert covered > 0.97
 
 
 def test_a_long_lens_gives_the_same_lines():

@@ -141,7 +141,8 @@ def find_lines(
         lines += find_poles(cloud, ground, seen, origin=origin)
     image_lines = find_image_lines(image, masks, camera)
     if structure:
-        lines += cloud_lines(find_structure_lines(cloud, seen, rng, origin))
+        eye = -T_cam_lidar[:3, :3].T @ T_cam_lidar[:3, 3]
+        lines += cloud_lines(find_structure_lines(cloud, seen, rng, origin), eye)
         image_lines += find_image_segments(image, camera)
     aside = np.cross(up, forward)
     return LineFrame(tuple(lines), tuple(image_lines), tuple(reasons), aside / np.linalg.norm(aside))

@@ -73,15 +73,12 @@ def find_structure_lines(
         # With rings the same borders are known better from their jumps.
         lines += borders(planes, cells, xyz, spacing, rng)
     best = distinct(joined([line for line in lines if _sure(line)]))[:MOST_LINES]
-    return [
-        dataclasses.replace(line, start=line.start + shift, end=line.end + shift, points=index[line.points])
-        for line in best
-    ]
+    return [dataclasses.replace(line.moved(np.eye(3), shift), points=index[line.points]) for line in best]
 
 
-def cloud_lines(lines: Sequence[UncertainLine]) -> list[CloudLine]:
-    """The lines as records of class ``structure``."""
-    return [structure_line(line) for line in lines]
+def cloud_lines(lines: Sequence[UncertainLine], eye: Floats) -> list[CloudLine]:
+    """The lines as records of class ``structure``, for a camera at ``eye`` (3,), m, LiDAR frame."""
+    return [structure_line(line, eye) for line in lines]
 
 
 def _pattern(cloud: PointCloud, xyz: Floats, keep: NDArray[np.bool_]) -> tuple[Floats, ScanPattern | None]:

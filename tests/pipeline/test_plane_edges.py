@@ -113,7 +113,8 @@ def test_a_line_turned_keeps_its_covariance_along_its_axes():
     R = Rotation.random(random_state=1).as_matrix()
     turned = line.moved(R, np.zeros(3))
     np.testing.assert_allclose(turned.axes, line.axes @ R.T, atol=1e-12)
-    record = structure_line(turned)
+    eye = np.array([0.5, 1.0, -2.0])
+    record = structure_line(turned, eye)
     arm = np.array([0.0, line.length]) - record.mean_m
     variance = record.sigma_m**2 * (1 / len(record.points) + np.outer(arm, arm) / record.spread)
-    np.testing.assert_allclose(variance, line.sideways, rtol=1e-6)
+    np.testing.assert_allclose(variance, turned.seen_from(eye), rtol=1e-6)

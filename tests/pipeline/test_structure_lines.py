@@ -241,6 +241,7 @@ def test_a_sensor_beside_the_origin():
     for line, other in zip(a, b, strict=True):
         np.testing.assert_allclose(other.start - origin, line.start, atol=5e-3)
         np.testing.assert_allclose(other.covariance, line.covariance, atol=1e-4)
+        np.testing.assert_allclose(other.axes, line.axes, atol=0.02)
 
 
 def test_vegetation_has_hardly_any_lines():
@@ -309,13 +310,14 @@ def test_records_keep_the_covariance_and_the_class():
     cloud = sweep([street(rng)], rng)
     found = lines_of(cloud)
     assert 0 < len(found) <= MOST_LINES
-    for line, record in zip(found, cloud_lines(found), strict=True):
+    eye = np.array([0.8, -0.3, -1.5])
+    for line, record in zip(found, cloud_lines(found, eye), strict=True):
         assert record.label == "structure"
         assert len(np.unique(record.points)) == len(record.points) > 0
         assert record.points.max() < len(cloud)
         arm = np.array([0.0, line.length]) - record.mean_m
         variance = record.sigma_m**2 * (1.0 / len(record.points) + np.outer(arm, arm) / record.spread)
-        np.testing.assert_allclose(variance, line.sideways, rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(variance, line.seen_from(eye), rtol=1e-4, atol=1e-9)
 
 
 def shown(lines, segments, camera, T):

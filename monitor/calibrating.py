@@ -103,10 +103,11 @@ def calibrate(
     if guesses is not None:
         rig = _guessed(rig, guesses)
     truth = {} if reference is None else _truth(reference, rig)
-    stored, far = CalibrationParameters(prior=prior or Prior()), CalibrationParameters(prior=FOUND)
     segmenter = Segmenter(model_bytes(model))
     calibrators = {
-        pair.name: Calibrator(mount_of(pair), Parameters(), segmenter, far if pair.name in found else stored)
+        pair.name: Calibrator(
+            mount_of(pair), Parameters(), segmenter, settings(found=pair.name in found, stored=prior)
+        )
         for pair in rig.pairs
     }
     intake = Intake(rig)
@@ -128,6 +129,16 @@ def calibrate(
     results = (_result(name, one.mount, one.finish(), truth.get(name)) for name, one in calibrators.items())
     relative_to = "stored" if guesses is None else "found"
     return tuple(result.model_copy(update={"relative_to": relative_to}) for result in results)
+
+
+def settings(*, found: bool, stored: Prior | None) -> CalibrationParameters:
+    """What a calibration believes of the extrinsic that it begins with.
+
+    Args:
+        found: It was found in the recording, not stored.
+        stored: How far off a stored one may be; None: as a mount that drifted.
+    """
+    return CalibrationParameters(prior=FOUND if found else stored or Prior())
 
 
 def _found(rig: Rig, guesses: Mapping[str, Floats]) -> frozenset[str]:

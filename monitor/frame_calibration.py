@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from monitor.calibrating import FOUND
+from monitor.calibrating import settings
 from monitor.clock import Clock
 from monitor.evaluated_frames import EvaluatedFrame
 from monitor.first_guess import PriorSigma, masks_of_network
 from pipeline import no_prior, se3
-from pipeline.calibration import Calibrated, CalibrationParameters, Calibrator
+from pipeline.calibration import Calibrated, Calibrator
 from pipeline.cloud_lanes import find_lanes
 from pipeline.cloud_poles import find_poles
 from pipeline.frame_modes import Prior
@@ -61,16 +61,15 @@ def calibrated(
         times: Of the stages.
         prior_sigma: ``--prior-sigma``, how far off the extrinsic may be; None: it is a first guess.
     """
-    prior = Prior()
+    guess, stored = None, None
     if prior_sigma is not None:
+        stored = Prior(prior_sigma.sigma_rad, prior_sigma.sigma_m)
         with times.stage("first guess"):
             guess = _found(frame, mount, segmenter, prior_sigma)
-        if guess is None:
-            # What was not found is as far off as the stored extrinsic that it is.
-            prior = Prior(prior_sigma.sigma_rad, prior_sigma.sigma_m)
-        else:
-            mount, prior = dataclasses.replace(mount, T_cam_lidar=guess), FOUND
-    calibrator = Calibrator(mount, Parameters(), segmenter, CalibrationParameters(prior=prior))
+    if guess is not None:
+        mount = dataclasses.replace(mount, T_cam_lidar=guess)
+    believed = settings(found=guess is not None, stored=stored)
+    calibrator = Calibrator(mount, Parameters(), segmenter, believed)
     calibrator.step(frame.pair, times.stage)
     return calibrator.finish(times.stage)
 

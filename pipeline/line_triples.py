@@ -159,7 +159,7 @@ class Triples:
 def enumerate_triples(
     lines: Lines, camera: CameraModel, up: Floats | None, p: TripleParameters
 ) -> Triples | NoTriples:
-    """All roots of all correspondences that an upright camera in front and above may have.
+    """All roots of all correspondences that an upright camera in front and above may have: CRLF (10)-(13).
 
     Args:
         lines: What takes part.

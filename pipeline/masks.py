@@ -124,7 +124,7 @@ def masks_from_probabilities(
     horizon: Floats | None = None,
     scale: tuple[float, float] | None = None,
 ) -> Masks:
-    """Lane and pole masks on the grid of the probabilities.
+    """Lane and pole masks on the grid of the probabilities: CRLF (7).
 
     Args:
         probabilities: float32 (C,h,w), 0..1, classes in the order of ``pipeline.labels``; the grid covers the

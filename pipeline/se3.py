@@ -94,7 +94,7 @@ def local(T_from: Floats, T_to: Floats) -> Floats:
 
 
 def apply(T: Floats, points: np.ndarray) -> Floats:
-    """Points (N,3) of any float type mapped by the rigid 4x4 ``T``, float64 (N,3)."""
+    """Points (N,3) of any float type mapped by the rigid 4x4 ``T``, float64 (N,3): CRLF (1)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3], dtype=np.float64)
 
 

@@ -25,7 +25,7 @@ _MOST_POINTS = 1 << 14
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SemanticPoints:
-    """The points P of CRLF (3) and (6).
+    """The points P of CRLF (3) and CRLF (6).
 
     Attributes:
         lane: float32 (N,3), metres, LiDAR frame.
@@ -178,6 +178,8 @@ def random_search(
     parameters: RandomSearchParameters = RandomSearchParameters(),
 ) -> Refinement:
     """Algorithm 1 of CRLF: random steps from the best extrinsic so far, smaller from stage to stage.
+
+    It seeks the maximum of J, CRLF (14).
 
     ``R <- Exp(eta dr) R, t <- t + eta dt``, the decoupled update. Samples are judged in blocks and the first
     improvement is taken, after which the rest is judged anew: the outcome is that of one after the other.

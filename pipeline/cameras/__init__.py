@@ -88,7 +88,7 @@ def _limit(name: str, coefficients: bytes) -> float:
 
 
 def project(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Pixels of points in the camera frame.
+    """Pixels of points in the camera frame: CRLF (2), with the lens.
 
     Args:
         camera: Intrinsics.

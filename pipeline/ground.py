@@ -126,7 +126,7 @@ class Ground:
 
 
 def plane_basis(normal: Floats) -> Floats:
-    """Rows of (2,3): unit directions that span the plane of a unit ``normal`` (3,). CRLF (4), heading open."""
+    """Rows of (2,3): unit directions spanning the plane of a unit ``normal`` (3,): CRLF (4), heading open."""
     helper = np.zeros(3)
     helper[int(np.argmin(np.abs(normal)))] = 1.0
     first = np.cross(normal, helper)

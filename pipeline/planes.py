@@ -204,12 +204,19 @@ def _shaped(of_point: Indices, position: Floats, size: Floats) -> Cells:
     near = distance <= REACH_CELLS * size[:, None]
     neighbours = np.where(near, neighbours, np.arange(count)[:, None]).astype(np.int64)
     n = near.sum(axis=1)
-    offset = (position[neighbours] - position[:, None]) * near[:, :, None]
-    mean = offset.sum(axis=1) / n[:, None]
-    C = np.matmul(offset.transpose(0, 2, 1), offset) / n[:, None, None] - mean[:, :, None] * mean[:, None, :]
-    values, V = np.linalg.eigh(C)
+    # A cell beyond reach stands for itself there: at no offset, it adds nothing.
+    x, y, z = (np.ascontiguousarray(p)[neighbours] - p[:, None] for p in position.T)
+    mean = [a.sum(axis=1) / n for a in (x, y, z)]
+
+    C = np.stack(
+        [
+            np.einsum("nk,nk->n", (x, y, z)[i], (x, y, z)[j]) / n - mean[i] * mean[j]
+            for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        ]
+    )
+    values, normal = least_axes(C)
     extent = np.sqrt(np.maximum(values, 0.0))
-    incidence = np.abs(np.einsum("ni,ni->n", V[:, :, 0], position)) / np.linalg.norm(position, axis=1)
+    incidence = np.abs(np.einsum("ni,ni->n", normal, position)) / np.linalg.norm(position, axis=1)
     flat = (
         (n >= MIN_CELLS)
         & (incidence >= LEAST_INCIDENCE)
@@ -217,7 +224,44 @@ def _shaped(of_point: Indices, position: Floats, size: Floats) -> Cells:
         & (extent[:, 0] <= FLATNESS * extent[:, 1])
         & (extent[:, 1] >= SLENDERNESS * extent[:, 2])
     )
-    return Cells(of_point, position, size, neighbours, V[:, :, 0], extent[:, 0], flat)
+    return Cells(of_point, position, size, neighbours, normal, extent[:, 0], flat)
+
+
+def least_axes(C: Floats) -> tuple[Floats, Floats]:
+    """Eigenvalues (M,3), ascending, of symmetric matrices, and the axes (M,3) of the least ones.
+
+    In closed form (the roots of a cubic by its angle): thousands of matrices at once, which an iteration
+    takes one by one. Where the least two are equal there is no such axis; it may be zero.
+
+    Args:
+        C: float64 (6,M), the elements xx, yy, zz, xy, xz, yz.
+    """
+    mean = (C[0] + C[1] + C[2]) / 3.0
+    a, b, c = C[:3] - mean
+    d, e, f = C[3:]
+    radius = np.sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
+    half_det = 0.5 * (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e))
+    angle = np.arccos(np.clip(half_det / np.maximum(radius**3, _TINY), -1.0, 1.0)) / 3.0
+    largest, least = (mean + 2.0 * radius * np.cos(angle + turn) for turn in (0.0, 2.0 * math.pi / 3.0))
+    values = np.stack([least, 3.0 * mean - largest - least, largest], axis=1)
+    # The axis is normal to all rows of C - least: of the three products of two the longest is the surest.
+    x, y, z = C[:3] - least
+    products = np.stack(
+        [
+            [d * f - e * y, e * d - x * f, x * y - d * d],
+            [d * z - e * f, e * e - x * z, x * f - d * e],
+            [y * z - f * f, f * e - d * z, d * f - y * e],
+        ]
+    )
+    square = (products * products).sum(axis=1)
+    longest = square.argmax(axis=0)
+    rows = np.arange(C.shape[1])
+    axis = products[longest, :, rows] / np.sqrt(np.maximum(square[longest, rows], _TINY))[:, None]
+    return values, axis
+
+
+_TINY = 1e-60
+"""Keeps matrices of nothing but zeros from dividing by it."""
 
 
 def _regions(cells: Cells) -> list[Indices]:

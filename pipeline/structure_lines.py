@@ -107,20 +107,24 @@ def _quality(line: UncertainLine) -> float:
 
 def joined(lines: list[UncertainLine]) -> list[UncertainLine]:
     """Pieces of one line of one kind, one behind the other, as one (3D merging of PLK V-C)."""
-    waiting = sorted(lines, key=_quality, reverse=True)
+    lines = sorted(lines, key=_quality, reverse=True)
+    start, end = _ends(lines)
+    kind = np.array([line.kind for line in lines])
+    free = np.ones(len(lines), dtype=bool)
     done: list[UncertainLine] = []
-    while waiting:
-        line = waiting.pop(0)
-        grown = True
+    for first in range(len(lines)):
+        if not free[first]:
+            continue
+        free[first] = False
+        whole, grown = lines[first], True
         while grown:
             grown = False
-            for k in _continuing(line, waiting):
-                whole = _joint(line, waiting[k])
-                if whole is not None:
-                    line, grown = whole, True
-                    del waiting[k]
+            for k in np.flatnonzero(free & (kind == whole.kind) & _continuing(whole, start, end)).tolist():
+                joint = _joint(whole, lines[k])
+                if joint is not None:
+                    whole, grown, free[k] = joint, True, False
                     break
-        done.append(line)
+        done.append(whole)
     return done
 
 
@@ -129,19 +133,15 @@ def _ends(lines: Sequence[UncertainLine]) -> tuple[Floats, Floats]:
     return np.array([a.start for a in lines]).reshape(-1, 3), np.array([a.end for a in lines]).reshape(-1, 3)
 
 
-def _continuing(line: UncertainLine, others: Sequence[UncertainLine]) -> list[int]:
-    """Which of the others may be a piece of the line before its start or behind its end."""
-    if not others:
-        return []
-    start, end = _ends(others)
+def _continuing(line: UncertainLine, start: Floats, end: Floats) -> NDArray[np.bool_]:
+    """Which others (N,), by their ends (N,3), may be a piece of the line beyond its ends."""
     along = (np.stack([start, end]) - line.start) @ line.direction
     low, high = along.min(axis=0), along.max(axis=0)
     gap = np.maximum(low - line.length, -high)
     span = end - start
     cosine = np.abs(span @ line.direction) / np.linalg.norm(span, axis=1)
-    same = np.array([other.kind == line.kind for other in others])
-    fits = same & (cosine >= math.cos(SAME_ANGLE)) & (gap <= JOIN_GAP_M) & (gap >= -0.5 * (high - low))
-    return np.flatnonzero(fits).tolist()
+    fits = (cosine >= math.cos(SAME_ANGLE)) & (gap <= JOIN_GAP_M) & (gap >= -0.5 * (high - low))
+    return np.asarray(fits)
 
 
 def _joint(line: UncertainLine, other: UncertainLine) -> UncertainLine | None:
@@ -180,25 +180,27 @@ _REGULAR_M = 1e-4
 
 def distinct(lines: list[UncertainLine]) -> list[UncertainLine]:
     """Lines without those that a surer one covers, the surest first."""
-    kept: list[UncertainLine] = []
-    for line in sorted(lines, key=_quality, reverse=True):
-        if not any(_covers(other, line) for other in kept):
-            kept.append(line)
-    return kept
+    lines = sorted(lines, key=_quality, reverse=True)
+    start, end = _ends(lines)
+    kept: list[int] = []
+    covered = np.zeros(len(lines), dtype=bool)
+    for k, line in enumerate(lines):
+        if not covered[k]:
+            kept.append(k)
+            covered |= _covers(line, start, end)
+    return [lines[k] for k in kept]
 
 
-def _covers(line: UncertainLine, other: UncertainLine) -> bool:
-    """Whether half of the other line lies along the line, so near that both are one edge."""
-    span = other.end - other.start
-    if abs(float(span @ line.direction)) < math.cos(SAME_ANGLE) * other.length:
-        return False
-    offset = np.stack([other.start, other.end]) - line.start
-    along = np.sort(offset @ line.direction)
-    common = min(float(along[1]), line.length) - max(float(along[0]), 0.0)
-    off = offset @ line.axes.T
+def _covers(line: UncertainLine, start: Floats, end: Floats) -> NDArray[np.bool_]:
+    """Of which lines (N,) half lies along the line, so near that both are one edge, by their ends (N,3)."""
+    length = np.linalg.norm(end - start, axis=1)
+    along = np.sort(np.stack([start - line.start, end - line.start]) @ line.direction, axis=0)
+    common = np.minimum(along[1], line.length) - np.maximum(along[0], 0.0)
     # The nearness of the part in common; ends beyond may have turned away.
-    near = abs(float(off[:, 0].mean())) <= SAME_M and abs(float(off[:, 1].mean())) <= _SAME_DEPTH_M
-    return near and common >= 0.5 * other.length
+    off = np.abs((0.5 * (start + end) - line.start) @ line.axes.T)
+    near = (off[:, 0] <= SAME_M) & (off[:, 1] <= _SAME_DEPTH_M)
+    same = along[1] - along[0] >= math.cos(SAME_ANGLE) * length
+    return np.asarray(same & near & (common >= 0.5 * length))
 
 
 _SAME_DEPTH_M = 0.5

@@ -94,7 +94,9 @@ def across(direction: Floats, place: Floats) -> Floats:
         helper[int(np.argmin(np.abs(direction)))] = 1.0
         depth, norm = np.cross(direction, helper), float(np.linalg.norm(np.cross(direction, helper)))
     depth = depth / norm
-    return np.stack([np.cross(direction, depth), depth])
+    (a, b, c), (x, y, z) = direction.tolist(), depth.tolist()
+    # Written out: np.cross takes 20 times as long for one pair, and lines come in hundreds.
+    return np.array([[b * z - c * y, c * x - a * z, a * y - b * x], [x, y, z]])
 
 
 def ends_covariance(along: Floats, ends: tuple[float, float], sigma: float) -> Floats:

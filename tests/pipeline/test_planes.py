@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.planes import MAX_SIGMA_M, MOST_CELLS, MOST_PLANES, find_planes, thinned
+from pipeline.planes import MAX_SIGMA_M, MOST_CELLS, MOST_PLANES, find_planes, least_axes, thinned
 from pipeline.records import Floats
 
 SPACING = 0.008
@@ -28,6 +28,24 @@ def room(rng, count=6000):
     x, y, z = np.eye(3) * [-4.0, -4.0, 3.0]
     parts = [patch(corner, a, b, count, rng) for a, b in ((y, z), (x, z), (x, y))]
     return np.concatenate(parts), np.repeat(np.arange(3), count)
+
+
+def test_axes_in_closed_form_are_those_of_the_iteration():
+    rng = np.random.default_rng(1)
+    turn = Rotation.random(500, random_state=2).as_matrix()
+    # Planes, thin and thick, balls, and a neighbourhood of one single place.
+    spread = np.column_stack([rng.uniform(0.0, 0.1, 500), rng.uniform(0.2, 1.0, (500, 2))])
+    spread[:50] = rng.uniform(0.0, 1.0, (50, 3))
+    spread[50:60, 0] = 0.0
+    spread[60] = 0.0
+    C = turn @ (spread[:, :, None] ** 2 * turn.transpose(0, 2, 1))
+    values, axis = least_axes(C[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].T)
+    expected, V = np.linalg.eigh(C)
+    np.testing.assert_allclose(values, expected, atol=1e-12)
+    clear = expected[:, 1] - expected[:, 0] > 1e-3
+    assert clear.sum() > 480
+    np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", axis, V[:, :, 0]))[clear], 1.0, atol=1e-9)
+    assert np.isfinite(axis).all()
 
 
 def test_the_walls_of_a_room():

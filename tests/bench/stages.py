@@ -189,7 +189,7 @@ def _of_lines(
     masks = masks_from_probabilities(
         segmenter.probabilities(pixels), pixels, parameters.masks, horizon, scale
     )
-    return lines.costs(pair, masks, mount)
+    return lines.costs(pair, masks, mount) | lines.coarse_cost(segmenter)
 
 
 def _of_judgements(location: str, mount: Mount, parameters: Parameters, intake: Intake) -> dict[str, float]:

@@ -166,7 +166,8 @@ def _pole(returns: _Returns, ground: Ground, members: Indices) -> CloudLine | No
     """The axis of one candidate, or None where it is no pole."""
     centre = np.median(returns.plan[members], axis=0)
     # The cells hold neighbours and may cut the pole; the square around the median holds its ring as well.
-    near = np.flatnonzero(np.abs(returns.plan - centre).max(axis=1) < RING_M[1])
+    beside = (np.abs(returns.plan[:, axis] - centre[axis]) < RING_M[1] for axis in (0, 1))
+    near = np.flatnonzero(np.logical_and(*beside))
     inside = np.hypot(*(returns.plan[near] - centre).T) < AXIS_M
     # A plate or a lamp is wider than its pole and stands beside it: it would bend the axis.
     slim = inside.copy()
@@ -188,7 +189,9 @@ def _axis(returns: _Returns, ground: Ground, near: Indices, shaft: NDArray[np.bo
             return None
         axis = total_least_squares(xyz[pole])
         beyond = np.linalg.norm(_across(xyz, axis), axis=1)
-        pole = shaft & (beyond < min(AXIS_M, max(3.0 * axis.sigma, _LEVEL_M / 2)))
+        before, pole = pole, shaft & (beyond < min(AXIS_M, max(3.0 * axis.sigma, _LEVEL_M / 2)))
+        if np.array_equal(before, pole):
+            break
     if axis is None or pole.sum() < MIN_POLE_POINTS:
         return None
     axis = total_least_squares(xyz[pole])

@@ -344,7 +344,8 @@ def _straight_parts(
         first, last = edges.position[chain[order[0]]], edges.position[chain[order[-1]]]
         chord = (last - first) / max(float(np.linalg.norm(last - first)), 1e-9)
         off = edges.position[chain[order]] - first
-        off = np.linalg.norm(off - (off @ chord)[:, None] * chord, axis=1)
+        off = off - (off @ chord)[:, None] * chord
+        off = (off * off).sum(axis=1)
         cut = int(np.clip(off.argmax(), 1, len(chain) - 1))
         waiting += [chain[order[:cut]], chain[order[cut:]]]
     return parts
@@ -352,7 +353,7 @@ def _straight_parts(
 
 def _axis(points: Floats) -> tuple[Floats, Floats, Floats]:
     """Mean (3,), direction (3,) and positions (M,) along the line of least squares through points (M,3)."""
-    mean = points.mean(axis=0)
+    mean = points.sum(axis=0) / len(points)
     centred = points - mean
     direction = np.asarray(np.linalg.eigh(centred.T @ centred)[1][:, 2])
     return mean, direction, np.asarray(centred @ direction)

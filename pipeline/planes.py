@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pipeline.ground import plane_basis
+from pipeline.medians import median
 from pipeline.records import Floats, read_only
 
 Indices: TypeAlias = NDArray[np.int64]
@@ -267,25 +268,23 @@ _TINY = 1e-60
 def _regions(cells: Cells) -> list[Indices]:
     """Groups of flat cells, each connected by neighbours whose planes go on into each other."""
     count, k = cells.neighbours.shape
-    a = np.repeat(np.arange(count), k)
-    b = cells.neighbours.ravel()
-    both = cells.flat[a] & cells.flat[b] & (a != b)
+    flat = np.flatnonzero(cells.flat)
+    a, b = np.repeat(flat, k), cells.neighbours[flat].ravel()
+    both = cells.flat[b] & (a != b)
     a, b = a[both], b[both]
-    between = cells.position[b] - cells.position[a]
+    for end in (0, 1):
+        between = cells.position[b] - cells.position[a]
+        level = np.abs(np.einsum("ni,ni->n", cells.normal[(a, b)[end]], between)) <= 0.5 * BAND_M
+        a, b = a[level], b[level]
     agree = np.abs(np.einsum("ni,ni->n", cells.normal[a], cells.normal[b])) >= math.cos(MAX_BEND)
-    for end in (a, b):
-        agree &= np.abs(np.einsum("ni,ni->n", cells.normal[end], between)) <= 0.5 * BAND_M
     a, b = a[agree], b[agree]
     graph = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(count, count))
     label = connected_components(graph, directed=False)[1]
-    return [group for group in _groups(label) if len(group) >= MIN_CELLS]
-
-
-def _groups(label: NDArray[np.integer]) -> list[Indices]:
-    """Indices of the members of each label."""
-    if len(label) == 0:
+    # Most cells are a group of their own, and go before anything is done per group.
+    members = np.flatnonzero(np.bincount(label, minlength=1)[label] >= MIN_CELLS)
+    if len(members) == 0:
         return []
-    order = np.argsort(label, kind="stable")
+    order = members[np.argsort(label[members], kind="stable")]
     return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
@@ -322,7 +321,7 @@ _PEEL_ROUNDS = 3
 
 def _fit(points: Floats) -> tuple[Floats, Floats, float]:
     """Normal, mean and rms of the plane of least squared distances to points (N,3)."""
-    centre = points.mean(axis=0)
+    centre = points.sum(axis=0) / len(points)
     centred = points - centre
     values, V = np.linalg.eigh(centred.T @ centred)
     return V[:, 0], centre, math.sqrt(max(float(values[0]), 0.0) / max(len(points) - 3, 1))
@@ -379,17 +378,18 @@ def _plane(xyz: Floats, points: Indices, fitted: Indices) -> Plane | None:
     """The plane of least squares through ``fitted``, its noise, and which of ``points`` lie on it."""
     if len(fitted) < MIN_CELLS:
         return None
-    normal, centre, _ = _fit(xyz[fitted])
-    height = np.abs((xyz[fitted] - centre) @ normal)
-    band = min(BAND_M, max(_BAND_SIGMAS * 1.48 * float(np.median(height)), _LEAST_BAND_M))
-    fitted = fitted[height <= band]
-    if len(fitted) < MIN_CELLS:
+    own = xyz[fitted]
+    normal, centre, _ = _fit(own)
+    height = np.abs((own - centre) @ normal)
+    band = min(BAND_M, max(_BAND_SIGMAS * 1.48 * median(height), _LEAST_BAND_M))
+    own = own[height <= band]
+    if len(own) < MIN_CELLS:
         return None
-    normal, centre, sigma = _fit(xyz[fitted])
+    normal, centre, sigma = _fit(own)
     if sigma > MAX_SIGMA_M or abs(float(normal @ centre)) < LEAST_INCIDENCE * float(np.linalg.norm(centre)):
         return None
     basis = plane_basis(normal)
-    plan = (xyz[fitted] - centre) @ basis.T
+    plan = (own - centre) @ basis.T
     rows = np.column_stack([np.ones(len(plan)), plan])
     covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
     on = points[np.abs((xyz[points] - centre) @ normal) <= band]

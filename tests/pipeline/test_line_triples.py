@@ -34,6 +34,18 @@ def lines_of(seed, *, lanes=3, poles=3):
     return truth, *scenes.lines_of(rng, truth, strips, posts)
 
 
+def longer(cloud, behind):
+    """The same lines; lanes begin so many metres further back."""
+    back = np.array([behind, 0.0, 0.0])
+    return [
+        dataclasses.replace(line, **{end: getattr(line, end) - back}, mean_m=None)
+        if line.label == "lane"
+        else line
+        for line in cloud
+        for end in ["start" if line.start[0] < line.end[0] else "end"]
+    ]
+
+
 def in_front_part(T, line):
     """Projections of the part of a line beyond the nearest depth, sampled densely, px."""
     share = np.linspace(0.0, 1.0, 4001)[:, None]
@@ -56,15 +68,7 @@ def test_all_three_lines_lie_on_what_was_seen_of_them(behind):
     count = 0
     for seed in range(4):
         _, cloud, image = lines_of(100 + seed)
-        back = np.array([behind, 0.0, 0.0])
-        cloud = [
-            dataclasses.replace(line, **{end: getattr(line, end) - back}, mean_m=None)
-            if line.label == "lane"
-            else line
-            for line in cloud
-            for end in ["start" if line.start[0] < line.end[0] else "end"]
-        ]
-        lines = largest_lines(cloud, image, P)
+        lines = largest_lines(longer(cloud, behind), image, P)
         found = enumerate_triples(lines, CAMERA, None, P)
         for T, c, i in zip(found.T_cam_lidar, found.cloud, found.image, strict=True):
             pairs = [
@@ -75,6 +79,29 @@ def test_all_three_lines_lie_on_what_was_seen_of_them(behind):
             assert all(covers(T, *pair) for pair in pairs)
             count += 1
     assert count > 20
+
+
+def has_truth(truth, cloud, image):
+    """Whether a root is near the truth."""
+    found = enumerate_triples(largest_lines(cloud, image, P), CAMERA, None, P)
+    if isinstance(found, NoTriples):
+        return False
+    return any(
+        se3.rotation_angle(T[:3, :3], truth[:3, :3]) < 0.05 and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
+        for T in found.T_cam_lidar
+    )
+
+
+def test_of_a_lane_that_runs_on_behind_the_part_in_front_counts():
+    """The image shows the near part alone; a point behind the camera projects beyond the vanishing point."""
+    for seed in range(4):
+        truth, cloud, image = lines_of(100 + seed, lanes=2)
+        near = []
+        for line in image:
+            foot, other = sorted((line.start, line.end), key=lambda end: -end[1])
+            cut = ImageLine("lane", foot, foot + 0.4 * (other - foot), line.sigma_px)
+            near.append(cut if line.label == "lane" else line)
+        assert has_truth(truth, longer(cloud, 60.0), near)
 
 
 @pytest.mark.parametrize("lane", [0, 1])
@@ -93,18 +120,8 @@ def test_a_lane_seen_where_the_cloud_has_none_is_no_match(lane):
     ]
     poles = [line for line in image if line.label == "pole"]
 
-    def has_truth(seen):
-        found = enumerate_triples(largest_lines(cloud, seen, P), CAMERA, None, P)
-        if isinstance(found, NoTriples):
-            return False
-        return any(
-            se3.rotation_angle(T[:3, :3], truth[:3, :3]) < 0.05
-            and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
-            for T in found.T_cam_lidar
-        )
-
-    assert has_truth([*lanes, *poles])
-    assert not has_truth([*beyond, *poles])
+    assert has_truth(truth, cloud, [*lanes, *poles])
+    assert not has_truth(truth, cloud, [*beyond, *poles])
 
 
 def post(x, y, height):

@@ -13,14 +13,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import fusion, line_witness, se3
+from pipeline import se3
+from pipeline.cloud_lanes import find_lanes
+from pipeline.cloud_poles import find_poles
 from pipeline.edge_witness import EdgeBatch, EdgeFrame, batch_of
 from pipeline.edges import Edges, find_edges
 from pipeline.ego import Ego
-from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, evened, find_tops, weighed
-from pipeline.fusion import Testimony
+from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, evened, find_tops, joined_by, weighed
 from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
+from pipeline.line_judge import LineJudge, judged_frame
+from pipeline.line_witness import in_view
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
@@ -38,9 +41,8 @@ class CalibrationParameters:
         prior: How far off the first guess may be.
         modes: How fits are sought and compared.
         most_frames: Frames of a drive that are solved jointly, evenly spread: 20 take 100 MB.
-        line_frames: Frames of a drive whose lines are held against the answer of the edges: the network takes
-            longer than all the rest.
-        least_line_fit: Chance of right pairs of lines to fit each other no better; below it some are wrong.
+        line_frames: Frames of a drive whose lanes and poles judge between fits of the edges: the network
+            takes a good part of the time.
         least_edges: Fewer edges fit anywhere: some five of them share an object, and six axes ask for three
             objects each.
         least_contrast: Score at the estimate over chance, minus 1 (as in the watch).
@@ -53,7 +55,6 @@ class CalibrationParameters:
     modes: ModeParameters = field(default_factory=ModeParameters)
     most_frames: int = 20
     line_frames: int = 4
-    least_line_fit: float = 1e-3
     least_edges: int = 100
     least_contrast: float = 0.15
     least_peak: float = 4.5
@@ -241,52 +242,39 @@ class Calibrator:
         rng = np.random.default_rng(self._parameters.seed)
         with stage("search"):
             tops = find_tops(self._batch(self._kept), T_guess, prior, modes, rng)
+        T_best = se3.retract(T_guess, tops[0][0])
+        # The edges in view, and which stand for what part of it, are those of the best fit.
+        batch = self._batch(self._picked_again(T_best))
+        judge = None
+        if self._segmenter is not None:
+            with stage("lines"):
+                judge = self._line_judge(self._segmenter, T_best)
+                starts = judge.starts(T_guess, T_best, prior.sigma, rng)
+                tops = joined_by(*starts, batch, T_guess, tops, prior, modes)
         with stage("refinement"):
-            # The edges in view, and which stand for what part of it, are those of the best fit.
-            there = self._picked_again(se3.retract(T_guess, tops[0][0]))
-            found = weighed(self._batch(there), T_guess, tops, prior, modes, rng)
-        with stage("lines"):
-            lines = self._lines_at(se3.retract(T_guess, found.tops[0][0]))
-        return self.judged(found, lines)
+            found = weighed(batch, T_guess, tops, prior, modes, rng, None if judge is None else judge.odds)
+        return self.judged(found)
 
-    def _lines_at(self, T_best: Floats) -> Testimony | None:
-        """What lanes and poles say against the best fit, vehicle axes; None where they say nothing."""
-        if self._segmenter is None:
-            return None
-        mount = dataclasses.replace(self.mount, T_cam_lidar=T_best)
+    def _line_judge(self, segmenter: Segmenter, T_best: Floats) -> LineJudge:
+        """Lanes and poles of some frames, around what the best fit sees, and masks of their images."""
+        mount = self.mount
         rng = np.random.default_rng(self._parameters.seed)
         horizon = horizon_line(mount.camera, T_best[:3, :3] @ mount.up)
         frames = []
         for kept in self._kept[:: -(-len(self._kept) // self._settings.line_frames)]:
+            if kept.ground is None:
+                continue
             pixels = kept.image.pixels
-            masks = masks_from_probabilities(
-                self._segmenter.probabilities(pixels),
-                pixels,
-                self._parameters.masks,
-                horizon,
-                grid_scale(*kept.image.size),
-            )
-            frames.append(
-                line_witness.find_lines(
-                    kept.cloud,
-                    kept.image,
-                    masks,
-                    mount.camera,
-                    T_best,
-                    up=mount.up,
-                    forward=mount.forward,
-                    rng=rng,
-                    ground=kept.ground,
-                    origin=self._origin,
-                )
-            )
-        solution = line_witness.solve_lines(frames, mount.camera, T_best)
-        estimate = solution.estimate
-        if estimate.features == 0 or solution.fit < self._settings.least_line_fit:
-            return None
-        B = se3.vehicle_block(mount.R_vehicle_cam)
-        own = Testimony(B @ estimate.xi, B @ estimate.information @ B.T)
-        return fusion.with_floor(own, self._parameters.test.lines_floor())
+            probabilities = segmenter.probabilities(pixels)
+            scale = grid_scale(*kept.image.size)
+            masks = masks_from_probabilities(probabilities, pixels, self._parameters.masks, horizon, scale)
+            seen = in_view(kept.cloud, mount.camera, T_best)
+            lines = [
+                *find_lanes(kept.cloud, kept.ground, seen, rng, origin=self._origin),
+                *find_poles(kept.cloud, kept.ground, seen, origin=self._origin),
+            ]
+            frames.append(judged_frame(kept.cloud, lines, masks, mount.camera))
+        return LineJudge(tuple(frames), mount.camera)
 
     def _picked_again(self, T_cam_lidar: Floats) -> list[_Kept]:
         """The frames with the edges in view from another extrinsic; as before where one has none."""
@@ -306,13 +294,8 @@ class Calibrator:
         )
         return evened(joined)
 
-    def judged(self, found: EdgeModes, lines: Testimony | None) -> Calibrated:
-        """Estimate, errors and words from the modes.
-
-        Args:
-            found: Where the edges fit.
-            lines: What the lines say against the best fit, vehicle axes, or None: it may contradict.
-        """
+    def judged(self, found: EdgeModes) -> Calibrated:
+        """Estimate, errors and words from the modes."""
         mount = self.mount
         T_guess = mount.T_cam_lidar
         modes = tuple(
@@ -322,12 +305,8 @@ class Calibrator:
         B = se3.vehicle_block(mount.R_vehicle_cam)
         covariance = B @ found.covariance @ B.T + self._parameters.test.floor()
         information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        why = ""
         if found.contrast < self._settings.least_contrast or found.peak < self._settings.least_peak:
             why = "image and cloud show nothing in common (dark, blocked, no edges, or a first guess far off)"
-        elif lines is not None and fusion.contradiction(Testimony(np.zeros(6), information), lines):
-            why = "lines and edges contradict each other beyond their errors"
-        if why:
             return dataclasses.replace(
                 self._nothing(why), modes=modes, contrast=found.contrast, peak=found.peak
             )

@@ -7,7 +7,7 @@ most parts, a false one in a few. Errors come from the same question, asked of t
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -22,6 +22,8 @@ from pipeline.records import Floats
 
 Top: TypeAlias = tuple[Floats, float]
 """A maximum: xi (6,) against the first guess in camera axes, and its score."""
+Judge: TypeAlias = Callable[[Floats, np.random.Generator], Floats]
+"""How likely each of the extrinsics (M,4,4) is, (M,), above 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +121,7 @@ def weighed(
     prior: Prior,
     parameters: ModeParameters,
     rng: np.random.Generator,
+    second: Judge | None = None,
 ) -> EdgeModes:
     """Climbs to the top of each mode, weighs them against each other, says how well the best is known.
 
@@ -129,6 +132,7 @@ def weighed(
         prior: How far off the first guess may be.
         parameters: See there.
         rng: Draws weights.
+        second: Another judge, whose evidence is not of edges; None: there is none.
     """
     tops = _refined(batch, T_guess, tops, parameters)
     part = _parts(batch)
@@ -137,6 +141,8 @@ def weighed(
     wins = np.bincount(np.argmax(weights @ scores.T, axis=1), minlength=len(tops))
     distance = np.array([np.sum((xi / prior.sigma) ** 2) for xi, _ in tops])
     shares = wins * np.exp(-0.5 * (distance - distance[wins > 0].min()))
+    if second is not None:
+        shares = shares * second(np.stack([se3.retract(T_guess, xi) for xi, _ in tops]), rng)
     shares = shares / shares.sum()
     order = np.argsort(-shares, kind="stable")
     tops, shares = [tops[k] for k in order], shares[order]
@@ -173,6 +179,42 @@ def find_tops(
     tops.sort(key=lambda top: -top[1])
     # A first guess within whose reach no maximum lies stands for itself.
     return _refined(batch, T_guess, tops[: parameters.refined] or [(guess, 0.0)], parameters)
+
+
+def joined_by(
+    summits: Floats,
+    places: Floats,
+    batch: EdgeBatch,
+    T_guess: Floats,
+    tops: Sequence[Top],
+    prior: Prior,
+    parameters: ModeParameters,
+) -> list[Top]:
+    """The maxima and those to which climbs from where another witness fits lead.
+
+    Args:
+        summits: float64 (S,4,4), extrinsics that are each climbed from on all edges.
+        places: float64 (P,4,4), extrinsics of which those where the edges begin to fit are climbed from.
+        batch: Edges and gradients.
+        T_guess: float64 (4,4), the first guess.
+        tops: Maxima that are known.
+        prior: How far off the first guess may be.
+        parameters: See there.
+    """
+    thin = batch.thinned(max(1, len(batch) // parameters.searched))
+    heights = [edge_witness.score_only(thin, T, 1).sum() for T in places]
+    steps = np.array([se3.local(T_guess, T) for T in places]).reshape(-1, 6)
+    # Half as far apart as climbs of the edges alone: these places hold six axes, not the turns only.
+    picked = _apart(steps, heights, parameters.climbed, 0.5 * parameters.spread, [])
+    found: list[Top] = []
+    _climb(thin, T_guess, [(xi, (1, 0)) for xi in picked], found, prior, parameters)
+    found.sort(key=lambda top: -top[1])
+    further = [*found[: parameters.refined], *((se3.local(T_guess, T), 0.0) for T in summits)]
+    joined = list(tops)
+    for top in _refined(batch, T_guess, further, parameters):
+        if np.all(np.abs(top[0]) <= parameters.farthest * prior.sigma):
+            _keep(joined, top, parameters.apart)
+    return joined
 
 
 def _refined(batch: EdgeBatch, T_guess: Floats, tops: Sequence[Top], parameters: ModeParameters) -> list[Top]:
@@ -303,5 +345,19 @@ def _scatter(
     for weights in rng.exponential(size=(parameters.draws_of_place, int(part.max()) + 1)):
         redrawn = dataclasses.replace(batch, weight=batch.weight * weights[part])
         moved.append(edge_witness.ascend(redrawn, T_guess, xi, 0, parameters.edge_witness)[0] - xi)
-    D = np.stack(moved)
-    return np.asarray(D.T @ D / len(D), dtype=np.float64)
+    return shrunk_moments(np.stack(moved))
+
+
+def shrunk_moments(D: Floats) -> Floats:
+    """Second moments (6,6) of draws (N,6), their correlations shrunk by what chance gives them.
+
+    Chance correlations of few draws leave directions in which hardly any error seems possible. The share to
+    leave is that of least mean square error (Schaefer and Strimmer): the variance of all correlations, by the
+    normal approximation (1 - r^2)^2 / N, over the sum of their squares.
+    """
+    C = np.asarray(D.T @ D / len(D), dtype=np.float64)
+    sigma = np.sqrt(np.maximum(np.diag(C), np.finfo(np.float64).tiny))
+    r = (C / np.outer(sigma, sigma))[np.triu_indices(len(C), 1)]
+    squares = float((r**2).sum())
+    share = min(1.0, float(((1.0 - r**2) ** 2).sum()) / len(D) / squares) if squares > 0.0 else 0.0
+    return (1.0 - share) * C + share * np.diag(np.diag(C))

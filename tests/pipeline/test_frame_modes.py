@@ -7,7 +7,7 @@ import pytest
 from pipeline import edge_witness, se3
 from pipeline.edge_witness import UNITS, EdgeFrame, batch_of
 from pipeline.edges import CELLS, EdgeParameters, find_edges
-from pipeline.frame_modes import ModeParameters, Prior, evened, find_tops, weighed
+from pipeline.frame_modes import ModeParameters, Prior, evened, find_tops, joined_by, shrunk_moments, weighed
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground
 from pipeline.records import CameraImage
@@ -98,6 +98,58 @@ def test_where_parts_of_the_picture_disagree_neither_answer_is_claimed(batch, do
     other = np.abs(turns - turns[0]) > 0.7 * ghost
     assert bearing @ found.covariance @ bearing > found.shares[other].sum() * (0.7 * ghost) ** 2 > 0.0
     assert bearing @ found.covariance @ bearing > 4.0 * bearing @ clear.covariance @ bearing
+
+
+def test_another_judge_decides_between_fits_that_the_edges_leave_open(doubled, drive):
+    T, K = drive.parameters.T_stored, drive.parameters.camera.K
+    ghost = GHOST_PX / K[0, 0]
+    tops = find_tops(doubled, T, PRIOR, P, np.random.default_rng(1))
+    bearing = np.array([0.0, 1.0, 0.0, 1.0 / 15.0, 0.0, 0.0])
+
+    def heard(wanted):
+        def judge(T_all, rng):
+            del rng
+            turn = np.array([bearing @ se3.local(T, one) for one in T_all])
+            return np.where(np.abs(turn - wanted) < 0.3 * ghost, 1.0, 1e-3)
+
+        found = weighed(doubled, T, tops, PRIOR, P, np.random.default_rng(2), judge)
+        return bearing @ found.tops[0][0], found.shares[0]
+
+    for wanted in (0.0, ghost):
+        turn, share = heard(wanted)
+        assert abs(turn - wanted) < 0.15 * ghost
+        assert share > 0.5
+
+
+def test_climbs_from_where_another_witness_fits_add_what_they_find(batch, drive):
+    T = drive.parameters.T_stored
+    T_guess = se3.retract(T, np.array([1.5, -1.5, 1.5, 1.0, -1.0, 1.0]) * PRIOR.sigma)
+    near = se3.retract(T, 0.2 * UNITS)
+    poor = [(np.zeros(6), 0.0)]
+    none = np.zeros((0, 4, 4))
+    assert joined_by(none, none, batch, T_guess, poor, PRIOR, P) == poor
+    for summits, places in ((near[None], none), (none, near[None])):
+        joined = joined_by(summits, places, batch, T_guess, poor, PRIOR, P)
+        assert len(joined) == 2
+        assert np.abs(off(T, T_guess, joined[1][0])).max() < 0.8
+    far = se3.retract(T_guess, 6.0 * PRIOR.sigma)[None]
+    assert len(joined_by(far, none, batch, T_guess, poor, PRIOR, P)) == 1
+
+
+def test_chance_correlations_are_shrunk_and_sigmas_kept():
+    rng = np.random.default_rng(1)
+    L = np.eye(6) * UNITS
+    alone = shrunk_moments(rng.normal(size=(24, 6)) @ L)
+    D = rng.normal(size=(24, 6)) @ L
+    assert np.allclose(np.diag(shrunk_moments(D)), np.mean(D**2, axis=0))
+    r = np.corrcoef(D.T)
+    left = alone / np.sqrt(np.outer(np.diag(alone), np.diag(alone)))
+    assert np.abs(left - np.eye(6)).max() < 0.15 < np.abs(r - np.eye(6)).max()
+    # Turn and shift that trade for each other stay one direction.
+    D[:, 3] = D[:, 1] * UNITS[3] / UNITS[1]
+    kept = shrunk_moments(D)
+    assert kept[1, 3] > 0.6 * np.sqrt(kept[1, 1] * kept[3, 3])
+    assert np.array_equal(shrunk_moments(np.zeros((24, 6))), np.zeros((6, 6)))
 
 
 def test_the_first_guess_decides_between_equal_fits(doubled, drive):

@@ -85,11 +85,11 @@ def test_one_line_that_contradicts_four_does_not_win():
 
 
 def test_the_same_lines_seen_again_make_it_no_surer():
-    T = np.stack([TRUTH, off(1, 0.012)])
+    T = np.stack([TRUTH, off(1, 0.008)])
     once = scene().odds(T, np.random.default_rng(1))
     again = scene(copies=4).odds(T, np.random.default_rng(1))
-    assert 0.6 < once[0] < 0.99
-    assert again[0] == pytest.approx(once[0], abs=0.12)
+    assert 0.6 < once[0] < 0.9
+    assert again[0] == pytest.approx(once[0], abs=0.08)
 
 
 def test_without_lines_or_beside_the_image_every_fit_is_as_likely():

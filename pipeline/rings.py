@@ -324,6 +324,10 @@ def sensor_origin(cloud: PointCloud) -> Floats:
     Rings are cones with one apex (PROBE 8): seen from there each keeps its elevation. A cloud that was moved
     to the vehicle's frame shows its rings bent instead, which tells the way back.
     """
+    finite = np.isfinite(cloud.xyz).all(axis=1)
+    cloud = PointCloud(cloud.xyz[finite], ring=None if cloud.ring is None else cloud.ring[finite])
+    if len(cloud) == 0:
+        return np.zeros(3)
     turn = spin_turns(cloud)[0]
     ring = _rings(dataclasses.replace(cloud, xyz=(cloud.xyz @ turn.T).astype(np.float32)))
     if ring is None:

@@ -115,6 +115,16 @@ def test_one_laser_that_reads_bright_paints_no_line(middle):
     assert found(PointCloud(cloud.xyz, intensity), rng) == []
 
 
+@pytest.mark.xfail(strict=True, reason="a beam's track runs along such a line and has no flanks across it")
+def test_a_stop_line_across_the_road_is_found():
+    rng = np.random.default_rng(9)
+    cloud = scenes.sampled_cloud(rng, lanes=[], poles=[], rings_deg=0.2)
+    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
+    on = (np.abs(x - 11.0) < 0.15) & (np.abs(y) < 6.0)
+    (line,) = found(PointCloud(cloud.xyz, np.where(on, 0.6, cloud.intensity).astype(np.float32)), rng)
+    assert off_axis(line, np.array([11.0, -6, -1.73]), np.array([11.0, 6, -1.73])) < 0.15
+
+
 @pytest.mark.parametrize("slant_deg", [0.0, 30.0, 45.0])
 def test_lines_aslant_to_the_view_are_found(slant_deg):
     rng = np.random.default_rng(9)

@@ -5,11 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.cameras import raw_pixels
-from pipeline.image_lines import FLOOR_PX, find_image_lines
+from pipeline.image_lines import find_image_lines
 from pipeline.records import CameraImage, CameraModel, Masks
 
 _spec = importlib.util.spec_from_file_location(
@@ -37,16 +37,13 @@ def distances(line, start, end):
     st.floats(0, 1),
     st.floats(0, 1),
 )
-@example("lane", 1.57421875, 5.0, 0.0, 0.0)
 def test_centre_line_of_a_stroke_is_found_to_a_tenth_of_a_pixel(label, angle, width, du, dv):
     middle = np.array([240.0 + du, 160.0 + dv])
     arm = 80.0 * np.array([math.cos(angle), math.sin(angle)])
     image, masks = scenes.draw([(label, middle - arm, middle + arm, width)], rng=np.random.default_rng(1))
     (line,) = find_image_lines(image, masks, CAMERA)
     assert line.label == label
-    # A border that crosses one column or two is drawn with as few steps, which nothing averages.
-    steps = abs(angle - math.pi / 2) < 0.03
-    assert np.abs(distances(line, middle - arm, middle + arm)).max() < (FLOOR_PX if steps else 0.15)
+    assert np.abs(distances(line, middle - arm, middle + arm)).max() < 0.15
     assert np.linalg.norm(line.end - line.start) == pytest.approx(160.0, abs=12.0)
     assert 0.3 <= line.sigma_px < 0.5
 

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,13 +12,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from monitor.daemon import extrinsic_hash, mount_of
-from monitor.intake import Intake
-from monitor.messages import Message
+from monitor.intake import Intake, pairs_of
 from monitor.model_file import model_bytes
 from monitor.preparation import prepare
 from monitor.refusal import Account, drop_notes, refuse_unusable
 from monitor.rig import Rig, load_rig
-from monitor.sources import Source, open_source
+from monitor.sources import open_source
 from monitor.statements import TO_PEOPLE
 from monitor.status import AXIS_NAMES, AxisName, unit_of
 from pipeline import se3
@@ -116,7 +115,7 @@ def calibrate(
     }
     count = 0
     with open_source(location) as source:
-        for pair in _pairs(source, intake, stop):
+        for pair in pairs_of(source, intake, stop):
             dropped = calibrators[pair.pair].step(pair)
             accounts[pair.pair] = _counted(accounts[pair.pair], pair, dropped)
             count += 1
@@ -175,14 +174,6 @@ def _truth(reference: Path, rig: Rig) -> dict[str, Floats]:
             hint=f"it has: {', '.join(known)}" if known else "give a rig file that states the extrinsic",
         )
     return truth
-
-
-def _pairs(source: Source, intake: Intake, stop: threading.Event) -> Iterator[FramePair]:
-    for message in source:
-        if stop.is_set():
-            return
-        yield from intake.take(message) if isinstance(message, Message) else ()
-    yield from intake.flush()
 
 
 def _counted(account: Account, pair: FramePair, reason: DropReason | None) -> Account:

@@ -1,7 +1,7 @@
 """Single frames whose extrinsic is known: out of recordings, one by one, or simulated."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -9,8 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from monitor.daemon import mount_of
-from monitor.intake import Intake
-from monitor.messages import Message
+from monitor.intake import Intake, pairs_of
 from monitor.preparation import prepare
 from monitor.rig import Rig, parse_rig
 from monitor.sources import kinds, open_source
@@ -211,7 +210,7 @@ def _listed(location: Path, group: str, most: int, tell: Callable[[str], None]) 
     counts = dict.fromkeys(cameras, 0)
     intake = Intake(rig)
     with open_source(str(location)) as source:
-        for pair in _pairs(source, intake):
+        for pair in pairs_of(source, intake):
             camera = cameras[pair.pair]
             if pair.image.size != (camera.width, camera.height):
                 width, height = pair.image.size
@@ -251,17 +250,11 @@ def _spread(count: int, most: int) -> list[int]:
     return [round(k * (count - 1) / (most - 1)) for k in range(most)]
 
 
-def _pairs(source: Iterable[object], intake: Intake) -> Iterator[FramePair]:
-    for message in source:
-        yield from intake.take(message) if isinstance(message, Message) else ()
-    yield from intake.flush()
-
-
 def _read(recording: _Recording, reference_sigma: Floats) -> Iterator[EvaluatedFrame]:
     mounts = {pair.name: mount_of(pair) for pair in recording.rig.pairs}
     counts = dict.fromkeys(mounts, 0)
     with open_source(str(recording.location)) as source:
-        for pair in _pairs(source, Intake(recording.rig)):
+        for pair in pairs_of(source, Intake(recording.rig)):
             number = counts[pair.pair]
             counts[pair.pair] += 1
             if (pair.pair, number) in recording.chosen:

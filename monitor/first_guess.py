@@ -1,19 +1,18 @@
 """A first guess of the extrinsic where none is stored, or one that may be far off: before the calibration."""
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from monitor.intake import Intake
+from monitor.intake import Intake, pairs_of
 from monitor.line_masks import read_masks
-from monitor.messages import Message
 from monitor.model_file import open_segmenter
 from monitor.preparation import prepare
 from monitor.rig import Rig, RigPair
-from monitor.sources import Source, open_source
+from monitor.sources import open_source
 from pipeline import se3
 from pipeline.errors import InputError, RigError
 from pipeline.masks import horizon_line, masks_from_probabilities
@@ -77,19 +76,11 @@ def find_guesses(
     search = _Search(rig, sigma, masks, model, tell)
     intake = Intake(rig)
     with open_source(location) as source:
-        for pair in _pairs(source, intake, stop):
+        for pair in pairs_of(source, intake, stop):
             search.take(pair)
             if search.over:
                 break
     return search.guesses
-
-
-def _pairs(source: Source, intake: Intake, stop: threading.Event) -> Iterator[FramePair]:
-    for message in source:
-        if stop.is_set():
-            return
-        yield from intake.take(message) if isinstance(message, Message) else ()
-    yield from intake.flush()
 
 
 def first_guesses(

@@ -1,6 +1,8 @@
 """Messages in, pairs of sweep and image out, with an account of every frame: the intake of a whole rig."""
 
+import threading
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from monitor.messages import Decoded, Message, decode
@@ -151,3 +153,14 @@ def _frame_pair(pair: RigPair, paired: Paired[object, object]) -> FramePair:
         image_stamp_ns=camera.stamp_ns,
         sweep_s=lidar.sweep_s,
     )
+
+
+def pairs_of(
+    source: Iterable[object], intake: Intake, stop: threading.Event | None = None
+) -> Iterator[FramePair]:
+    """Every pair that the messages of a source make, the last ones too, unless ``stop`` ends it early."""
+    for message in source:
+        if stop is not None and stop.is_set():
+            return
+        yield from intake.take(message) if isinstance(message, Message) else ()
+    yield from intake.flush()

@@ -19,8 +19,8 @@ from monitor.sources import open_source
 from pipeline import cameras, se3
 from pipeline.edges import EdgeParameters, find_edges
 from pipeline.ground import fit_ground
+from pipeline.mount import Mount
 from pipeline.records import Floats, FramePair
-from pipeline.watch import Mount
 
 ORANGE, BLUE, GREY, RED, INK = (0, 120, 255), (255, 150, 0), (170, 170, 170), (60, 60, 220), (60, 50, 40)
 CROP = (470, 90, 480, 190)

@@ -20,9 +20,10 @@ from monitor.sources import Losses, Tick
 from monitor.statements import Identity
 from monitor.status import Provenance, State, first_in_precedence
 from pipeline.errors import RigError
+from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.segmentation import Segmenter
-from pipeline.watch import Mount, Watch
+from pipeline.watch import Watch
 
 
 def software() -> str:

@@ -14,11 +14,11 @@ from monitor.preparation import prepare
 from monitor.rig import Rig, parse_rig
 from monitor.sources import kinds, open_source
 from pipeline.errors import CalibwatchError, InputError
+from pipeline.mount import Mount
 from pipeline.records import CameraModel, Floats, FramePair
 from pipeline.se3 import stored_before
 from pipeline.simulation.drive import Drive
 from pipeline.simulation.rigs import draw_rig
-from pipeline.watch import Mount
 
 _DEEPEST = 4
 """Folders within folders that are searched for recordings."""

@@ -19,12 +19,12 @@ from pipeline.cloud_poles import find_poles
 from pipeline.frame_modes import Prior
 from pipeline.ground import Ground, fit_ground
 from pipeline.masks import horizon_line
+from pipeline.mount import Mount
 from pipeline.no_prior import FoundExtrinsic, find_extrinsic
 from pipeline.parameters import Parameters
 from pipeline.records import CloudLine, Floats
 from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter
-from pipeline.watch import Mount
 
 
 @dataclass(slots=True)

@@ -25,9 +25,10 @@ from monitor.status import (
     finite,
 )
 from pipeline import verdict
+from pipeline.belief import Belief
 from pipeline.fusion import Testimony
+from pipeline.mount import Mount
 from pipeline.records import Floats
-from pipeline.watch import Belief, Mount
 
 TO_PEOPLE = np.array([180.0 / math.pi] * 3 + [1.0] * 3)
 """rad, m -> deg, m."""

@@ -25,12 +25,13 @@ from pipeline.ground import Ground, fit_ground
 from pipeline.line_judge import LineJudge, judged_frame
 from pipeline.line_witness import in_view
 from pipeline.masks import horizon_line, masks_from_probabilities
+from pipeline.mount import Mount
 from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, Floats, FramePair, PointCloud, read_only
 from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter, grid_scale
-from pipeline.watch import DropReason, Mount, Stage
+from pipeline.watch import DropReason, Stage
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,7 +88,7 @@ class Evidence:
     """What a window says, in vehicle axes.
 
     Attributes:
-        drift: float64 (6,), motion of the mount since the extrinsic was stored, rad and m.
+        drift: float64 (6,), motion of the mount against what is expected of it, rad and m.
         covariance: float64 (6,6), of its random error.
         loss: Share of the best score lost when only the floor may explain it (inf where no score exists).
         contrast: Score at the estimate over chance, minus 1.
@@ -156,25 +156,46 @@ class Judgement:
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
-def stored_covariance(sigma_rad: float, sigma_m: float) -> Floats:
-    """C_ref (6,6) of an extrinsic known to ``sigma_rad`` and ``sigma_m`` per axis (FORMULAS F2)."""
-    return np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+@dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """What the estimate of a mount that has not moved is expected to be; vehicle axes, rad and m.
+
+    Attributes:
+        mean: float64 (6,), against the stored extrinsic: no mount shows exactly what is stored of it.
+        covariance: float64 (6,6), of that mean: C_ref of FORMULAS F2. Common to all windows.
+        floor: float64 (6,6), by how much the mean differs between scenes: Q of FORMULAS F2.
+        bound: float64 (6,), bound b_j of the difference between scenes (FORMULAS F5).
+    """
+
+    mean: Floats
+    covariance: Floats
+    floor: Floats
+    bound: Floats
 
 
-def judge(evidence: Evidence, C_ref: Floats, limits: Floats, parameters: DriftTestParameters) -> Judgement:
-    """Tests the stored extrinsic against the evidence of one window (FORMULAS F2, F5).
+def expectation_of_stored(sigma_rad: float, sigma_m: float, parameters: DriftTestParameters) -> Expectation:
+    """Of an extrinsic known to ``sigma_rad`` and ``sigma_m`` per axis, of whose rig no more is known."""
+    covariance = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+    return Expectation(np.zeros(6), covariance, parameters.floor(), parameters.bound())
+
+
+def judge(
+    evidence: Evidence, expectation: Expectation, limits: Floats, parameters: DriftTestParameters
+) -> Judgement:
+    """Tests the evidence of one window against what is expected of an unmoved mount (FORMULAS F2, F5).
 
     Args:
-        evidence: Estimate and its error, vehicle axes.
-        C_ref: float64 (6,6), covariance of the stored extrinsic.
+        evidence: Estimate, relative to the expected mean, and its error, vehicle axes.
+        expectation: Of a mount that has not moved.
         limits: float64 (6,), alert limits, rad and m.
         parameters: Thresholds.
     """
     sigma = np.sqrt(np.diag(evidence.covariance))
-    P = evidence.covariance + parameters.floor() + np.outer(evidence.feigned, evidence.feigned) + C_ref
+    P = evidence.covariance + np.outer(evidence.feigned, evidence.feigned)
+    P = P + expectation.floor + expectation.covariance
     P_inverse = np.linalg.inv(P)
     statistic = float(evidence.drift @ P_inverse @ evidence.drift)
-    bound = parameters.bound() + 2.0 * np.abs(evidence.feigned)
+    bound = expectation.bound + 2.0 * np.abs(evidence.feigned)
     protection = (parameters.K_fa + parameters.K_md) * sigma + bound
     seen = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
     convincing = evidence.loss > parameters.least_loss and evidence.persistent and seen

@@ -12,19 +12,18 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pipeline import drift_test, edge_witness, fusion, line_witness, se3, verdict, window
-from pipeline.deskew import SpinSense
-from pipeline.drift_test import Evidence, Judgement
-from pipeline.edge_witness import EdgeFrame, EdgeSolution
+from pipeline import line_witness, verdict, window
+from pipeline.belief import Belief, believe
+from pipeline.edge_witness import EdgeFrame
 from pipeline.edges import RING_JUMP, find_edges
-from pipeline.ego import Ego, Straightened
-from pipeline.fusion import Testimony
+from pipeline.ego import Ego
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import Ground, fit_ground
-from pipeline.line_witness import LineFrame, LineSolution
+from pipeline.line_witness import LineFrame
 from pipeline.masks import horizon_line, masks_from_probabilities
+from pipeline.mount import Mount
 from pipeline.parameters import Parameters
-from pipeline.records import CameraModel, Floats, FramePair, LineMatch, Masks, PointCloud, read_only
+from pipeline.records import Floats, FramePair, Masks, PointCloud
 from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter, grid_scale
 
@@ -48,66 +47,6 @@ def _unmeasured(name: str) -> AbstractContextManager[None]:
 _LEAST_EDGES = 20
 """Edges below which a frame says nothing: three per axis."""
 
-_LINES_FIT = 1e-3
-"""Chance of right pairs to fit each other no better; below it some are wrong, nobody knows which."""
-
-_LINES_REACH = 2.5
-"""Sigmas of the prior of the matching: an answer beyond it comes from lines taken for each other."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mount:
-    """What is stored of a pair.
-
-    Attributes:
-        camera: Intrinsics.
-        T_cam_lidar: float64 (4,4), the stored extrinsic.
-        T_vehicle_lidar: float64 (4,4), or None: the stored camera's own axes stand in.
-        sigma_rad: Uncertainty of the stored rotation per axis, rad.
-        sigma_m: Uncertainty of the stored translation per axis, m.
-        limits: float64 (6,), alert limits.
-        required: Axes that must be monitored for 'healthy'.
-        spin: Sense of rotation of the LiDAR where it is configured.
-    """
-
-    camera: CameraModel
-    T_cam_lidar: Floats
-    T_vehicle_lidar: Floats | None
-    sigma_rad: float
-    sigma_m: float
-    limits: Floats
-    required: tuple[str, ...]
-    spin: SpinSense | None = None
-
-    @property
-    def R_vehicle_cam(self) -> Floats:  # noqa: N802 - the name of the rotation
-        """Turns camera axes into vehicle axes, (3,3)."""
-        return se3.vehicle_axes(self.T_cam_lidar, self.T_vehicle_lidar)
-
-    @property
-    def up(self) -> Floats:
-        """Unit vector up, LiDAR frame."""
-        return np.asarray(self.R_vehicle_cam[2] @ self.T_cam_lidar[:3, :3], dtype=np.float64)
-
-    @property
-    def forward(self) -> Floats:
-        """Unit vector ahead (of the vehicle, else of the camera), LiDAR frame."""
-        return np.asarray(self.R_vehicle_cam[0] @ self.T_cam_lidar[:3, :3], dtype=np.float64)
-
-    def feigned(self, sweep: Straightened) -> Floats:
-        """Drift (6,), vehicle axes, that one sigma of error in a sweep's time would feign (FORMULAS G1)."""
-        R_vehicle_lidar = self.R_vehicle_cam @ self.T_cam_lidar[:3, :3]
-        if sweep.twist is None:
-            return np.array([0.0, 0.0, 0.0, sweep.sync_s * _ASSUMED_M_S, 0.0, 0.0])
-        centre = -self.T_cam_lidar[:3, :3].T @ self.T_cam_lidar[:3, 3]
-        velocity = sweep.twist.velocity + np.cross(sweep.twist.omega, centre)
-        motion = np.concatenate([R_vehicle_lidar @ sweep.twist.omega, R_vehicle_lidar @ velocity])
-        return np.asarray(sweep.sync_s * motion, dtype=np.float64)
-
-
-_ASSUMED_M_S = 10.0
-"""m/s ahead where the motion is not known: a street in town."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
@@ -128,29 +67,6 @@ class Findings:
     masks: Masks | None
     lines: LineFrame | None
     judged: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Belief:
-    """What is believed after the last judgement.
-
-    Attributes:
-        judgement: The test's result.
-        T_estimated: float64 (4,4), the estimated extrinsic.
-        edges: The edge witness, or None where it said nothing.
-        lines: The line witness, or None likewise.
-        edges_drift: Its testimony in vehicle axes, or None.
-        lines_drift: Likewise.
-        matched: Lines matched in each frame of the window that has lines, heard or not.
-    """
-
-    judgement: Judgement
-    T_estimated: Floats
-    edges: EdgeSolution | None
-    lines: LineSolution | None
-    edges_drift: Testimony | None
-    lines_drift: Testimony | None
-    matched: tuple[tuple[LineMatch, ...], ...]
 
 
 class Watch:
@@ -366,77 +282,7 @@ class Watch:
         return stamps[len(stamps) // 4]
 
     def _believe(self) -> Belief | None:
-        """Solves the window, fuses the witnesses, tests the stored extrinsic."""
-        mount, test = self.mount, self.parameters.test
-        R_vc = mount.R_vehicle_cam
-        B = se3.vehicle_block(R_vc)
-        C_ref = drift_test.stored_covariance(mount.sigma_rad, mount.sigma_m)
-        floor = test.floor()
-        feigned = np.mean([f.feigned for f in self._edge_frames] or [np.zeros(6)], axis=0)
-        edges = self._solve_edges(B.T @ (floor + np.outer(feigned, feigned) + C_ref) @ B)
-        matched = self._solve_lines()
-        lines = matched if matched is not None and _testifies(matched) else None
-        edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
-        lines_drift = None
-        if lines is not None:
-            own = _testimony(lines.estimate.xi, lines.estimate.information, B)
-            lines_drift = fusion.with_floor(own, test.lines_floor())
-        if edges_drift is None and lines_drift is None:
-            return None
-        contradicted = False
-        if edges_drift is not None and lines_drift is not None:
-            contradicted = fusion.contradiction(fusion.with_floor(edges_drift, floor), lines_drift)
-        fused = edges_drift or lines_drift
-        assert fused is not None  # noqa: S101 - one of the two is there
-        if edges_drift is not None and lines_drift is not None and not contradicted:
-            fused = fusion.intersected(edges_drift, lines_drift)
-        T_estimated = se3.retract(mount.T_cam_lidar, B.T @ fused.drift)
-        evidence = Evidence(
-            drift=se3.mount_drift(mount.T_cam_lidar, T_estimated, R_vc),
-            covariance=fused.covariance(),
-            loss=np.inf if edges is None else edges.loss,
-            contrast=np.inf if edges is None else edges.contrast,
-            peak=np.inf if edges is None else edges.peak,
-            persistent=edges is None or min(edges.block_gains, default=0.0) > 0.0,
-            frames=len(self._edge_frames),
-            contradicted=contradicted,
-            feigned=feigned,
-        )
-        return Belief(
-            judgement=drift_test.judge(evidence, C_ref, mount.limits, test),
-            T_estimated=read_only(T_estimated),
-            edges=edges,
-            lines=lines,
-            edges_drift=edges_drift,
-            lines_drift=lines_drift,
-            matched=() if matched is None else matched.matches,
-        )
-
-    def _solve_edges(self, floor: Floats) -> EdgeSolution | None:
-        if not self._edge_frames:
-            return None
-        settings = self.parameters.edge_witness
-        batch = edge_witness.batch_of(tuple(self._edge_frames), self.mount.camera, settings.most_edges)
-        rng = np.random.default_rng(self.parameters.seed)
-        return edge_witness.solve(batch, self.mount.T_cam_lidar, floor, settings, rng)
-
-    def _solve_lines(self) -> LineSolution | None:
         # Lines of before the window would testify to another mount.
         since = self._edge_frames[0].stamp_ns if self._edge_frames else 0
-        frames = [frame for stamp, frame in self._line_frames if stamp >= since]
-        if not frames:
-            return None
-        solution = line_witness.solve_lines(frames, self.mount.camera, self.mount.T_cam_lidar)
-        return solution if solution.estimate.features > 0 else None
-
-
-def _testifies(lines: LineSolution) -> bool:
-    """Whether matched lines may be heard: fitting each other, within reach of the matching."""
-    estimate = lines.estimate
-    within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
-    return within and lines.fit >= _LINES_FIT
-
-
-def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:
-    """Drift in vehicle axes from xi and its information in camera axes (FORMULAS A4; B is orthogonal)."""
-    return Testimony(B @ xi, B @ information @ B.T)
+        lines = [frame for stamp, frame in self._line_frames if stamp >= since]
+        return believe(self.mount, self.parameters, tuple(self._edge_frames), lines)

@@ -15,11 +15,11 @@ from pipeline.height_maps import Mode, height_maps
 from pipeline.image_lines import find_image_lines
 from pipeline.image_segments import find_image_segments
 from pipeline.line_witness import find_lines, in_view, solve_lines
+from pipeline.mount import Mount
 from pipeline.records import FramePair, Masks
 from pipeline.segmentation import Segmenter
 from pipeline.semantic_cost import RandomSearchParameters, points_in_view, points_of_lines, random_search
 from pipeline.structure_lines import find_structure_lines
-from pipeline.watch import Mount
 from tests.bench.dense_crf import least
 
 if TYPE_CHECKING:

@@ -18,10 +18,11 @@ from monitor.model_file import model_bytes
 from monitor.preparation import prepare
 from monitor.sources import open_source
 from pipeline.masks import horizon_line, masks_from_probabilities
+from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import CameraImage, FramePair, PointCloud
 from pipeline.segmentation import Segmenter, grid_scale
-from pipeline.watch import Mount, Watch
+from pipeline.watch import Watch
 from tests.bench import dense_crf, lines
 from tests.bench.dense_crf import least
 

@@ -8,9 +8,10 @@ from monitor.intake import Intake
 from monitor.rig import parse_rig
 from monitor.statements import Identity
 from monitor.status import Provenance
+from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import CameraImage, CameraModel, FramePair, PointCloud
-from pipeline.watch import Mount, Watch
+from pipeline.watch import Watch
 
 CAMERA = CameraModel("pinhole", np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), np.zeros(0), 64, 48)
 FORWARD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])

@@ -9,9 +9,10 @@ import pytest
 from monitor.statements import Identity, Measured, status_of
 from monitor.status import AXIS_NAMES, Provenance, Rates
 from pipeline import fusion, verdict
+from pipeline.belief import Belief
 from pipeline.drift_test import Judgement
+from pipeline.mount import Mount
 from pipeline.records import CameraModel
-from pipeline.watch import Belief, Mount
 
 NONE = Provenance(hash=None, version=None)
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.2, 0.15, 0.15])

@@ -8,13 +8,13 @@ import pytest
 from pipeline import labels, se3
 from pipeline.calibration import CalibrationParameters, Calibrator, calibrate_frames, held_directions, leaning
 from pipeline.frame_modes import EdgeModes, ModeParameters, Prior
+from pipeline.mount import Mount
 from pipeline.observability import observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, FramePair, PointCloud
 from pipeline.segmentation import grid_size
 from pipeline.simulation.drive import Drive
 from pipeline.simulation.rigs import draw_rig
-from pipeline.watch import Mount
 
 QUICK = CalibrationParameters(modes=ModeParameters(draws=64, climbed=2, draws_of_place=8))
 DRIFTS = [

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -6,11 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.drift_test import DriftTestParameters, Evidence, judge, stored_covariance
+from pipeline.drift_test import DriftTestParameters, Evidence, expectation_of_stored, judge
 
 P = DriftTestParameters()
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.20, 0.15, 0.15])
-C_REF = stored_covariance(math.radians(0.1), 0.02)
+STORED = expectation_of_stored(math.radians(0.1), 0.02, P)
+C_REF = STORED.covariance
 SURE = np.diag([math.radians(0.02) ** 2] * 3 + [0.005**2] * 3)
 """Covariance of a good window."""
 
@@ -22,7 +24,8 @@ def evidence(drift=None, covariance=SURE, **changes):
 
 
 def judged(drift=None, covariance=SURE, *, C_ref=C_REF, limits=LIMITS, parameters=P, **changes):
-    return judge(evidence(drift, covariance, **changes), C_ref, limits, parameters)
+    expected = dataclasses.replace(STORED, covariance=C_ref)
+    return judge(evidence(drift, covariance, **changes), expected, limits, parameters)
 
 
 def unit(axis, size):

@@ -8,12 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline import se3
+from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, CameraModel, FramePair, PointCloud
 from pipeline.simulation.drive import Drive, DriveParameters
 from pipeline.simulation.lidar import spinning
 from pipeline.simulation.scene import SceneParameters
-from pipeline.watch import Mount, Watch
+from pipeline.watch import Watch
 
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.20, 0.15, 0.15])
 CAMERA = CameraModel(

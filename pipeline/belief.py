@@ -1,0 +1,136 @@
+"""What a window of frames says about the mount: both witnesses solved, fused, and tested."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import drift_test, edge_witness, fusion, line_witness, se3
+from pipeline.drift_test import Evidence, Judgement
+from pipeline.edge_witness import EdgeFrame, EdgeSolution
+from pipeline.fusion import Testimony
+from pipeline.line_witness import LineFrame, LineSolution
+from pipeline.mount import Mount
+from pipeline.parameters import Parameters
+from pipeline.records import Floats, LineMatch, read_only
+
+_LINES_FIT = 1e-3
+"""Chance of right pairs to fit each other no better; below it some are wrong, nobody knows which."""
+
+_LINES_REACH = 2.5
+"""Sigmas of the prior of the matching: an answer beyond it comes from lines taken for each other."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """What is believed after the last judgement.
+
+    Attributes:
+        judgement: The test's result.
+        T_estimated: float64 (4,4), the estimated extrinsic.
+        edges: The edge witness, or None where it said nothing.
+        lines: The line witness, or None likewise.
+        edges_drift: Its testimony in vehicle axes, against the expected extrinsic, or None.
+        lines_drift: Likewise.
+        matched: Lines matched in each frame of the window that has lines, heard or not.
+    """
+
+    judgement: Judgement
+    T_estimated: Floats
+    edges: EdgeSolution | None
+    lines: LineSolution | None
+    edges_drift: Testimony | None
+    lines_drift: Testimony | None
+    matched: tuple[tuple[LineMatch, ...], ...]
+
+
+def believe(
+    mount: Mount,
+    parameters: Parameters,
+    edge_frames: Sequence[EdgeFrame],
+    line_frames: Sequence[LineFrame],
+) -> Belief | None:
+    """Solves the window, fuses the witnesses, tests the extrinsic that is expected to hold.
+
+    Args:
+        mount: What is stored of the pair.
+        parameters: Settings.
+        edge_frames: The window's frames with edges, ascending in time.
+        line_frames: The window's frames with lines, likewise.
+
+    Returns:
+        What is believed of the mount, or None where neither witness says anything.
+    """
+    test = parameters.test
+    R_vc = mount.R_vehicle_cam
+    B = se3.vehicle_block(R_vc)
+    expectation = mount.expectation(test)
+    T_expected = se3.retract(mount.T_cam_lidar, B.T @ expectation.mean)
+    feigned = np.mean([f.feigned for f in edge_frames] or [np.zeros(6)], axis=0)
+    doubt = expectation.floor + np.outer(feigned, feigned) + expectation.covariance
+    edges = _solve_edges(mount, parameters, edge_frames, T_expected, B.T @ doubt @ B)
+    matched = _solve_lines(mount, line_frames, T_expected)
+    lines = matched if matched is not None and _testifies(matched) else None
+    edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
+    lines_drift = None
+    if lines is not None:
+        own = _testimony(lines.estimate.xi, lines.estimate.information, B)
+        lines_drift = fusion.with_floor(own, test.lines_floor())
+    fused = edges_drift or lines_drift
+    if fused is None:
+        return None
+    contradicted = False
+    if edges_drift is not None and lines_drift is not None:
+        contradicted = fusion.contradiction(fusion.with_floor(edges_drift, expectation.floor), lines_drift)
+        fused = edges_drift if contradicted else fusion.intersected(edges_drift, lines_drift)
+    T_estimated = se3.retract(T_expected, B.T @ fused.drift)
+    evidence = Evidence(
+        drift=se3.mount_drift(T_expected, T_estimated, R_vc),
+        covariance=fused.covariance(),
+        loss=np.inf if edges is None else edges.loss,
+        contrast=np.inf if edges is None else edges.contrast,
+        peak=np.inf if edges is None else edges.peak,
+        persistent=edges is None or min(edges.block_gains, default=0.0) > 0.0,
+        frames=len(edge_frames),
+        contradicted=contradicted,
+        feigned=feigned,
+    )
+    return Belief(
+        judgement=drift_test.judge(evidence, expectation, mount.limits, test),
+        T_estimated=read_only(T_estimated),
+        edges=edges,
+        lines=lines,
+        edges_drift=edges_drift,
+        lines_drift=lines_drift,
+        matched=() if matched is None else matched.matches,
+    )
+
+
+def _solve_edges(
+    mount: Mount, parameters: Parameters, frames: Sequence[EdgeFrame], T_expected: Floats, doubt: Floats
+) -> EdgeSolution | None:
+    if not frames:
+        return None
+    settings = parameters.edge_witness
+    batch = edge_witness.batch_of(frames, mount.camera, settings.most_edges)
+    rng = np.random.default_rng(parameters.seed)
+    return edge_witness.solve(batch, T_expected, doubt, settings, rng)
+
+
+def _solve_lines(mount: Mount, frames: Sequence[LineFrame], T_expected: Floats) -> LineSolution | None:
+    if not frames:
+        return None
+    solution = line_witness.solve_lines(list(frames), mount.camera, T_expected)
+    return solution if solution.estimate.features > 0 else None
+
+
+def _testifies(lines: LineSolution) -> bool:
+    """Whether matched lines may be heard: fitting each other, within reach of the matching."""
+    estimate = lines.estimate
+    within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
+    return within and lines.fit >= _LINES_FIT
+
+
+def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:
+    """Drift in vehicle axes from xi and its information in camera axes (FORMULAS A4; B is orthogonal)."""
+    return Testimony(B @ xi, B @ information @ B.T)

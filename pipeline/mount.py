@@ -1,0 +1,69 @@
+"""What is stored of one pair of sensors, and its axes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import se3
+from pipeline.deskew import SpinSense
+from pipeline.drift_test import DriftTestParameters, Expectation, expectation_of_stored
+from pipeline.ego import Straightened
+from pipeline.records import CameraModel, Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mount:
+    """What is stored of a pair.
+
+    Attributes:
+        camera: Intrinsics.
+        T_cam_lidar: float64 (4,4), the stored extrinsic.
+        T_vehicle_lidar: float64 (4,4), or None: the stored camera's own axes stand in.
+        sigma_rad: Uncertainty of the stored rotation per axis, rad.
+        sigma_m: Uncertainty of the stored translation per axis, m.
+        limits: float64 (6,), alert limits.
+        required: Axes that must be monitored for 'healthy'.
+        spin: Sense of rotation of the LiDAR where it is configured.
+    """
+
+    camera: CameraModel
+    T_cam_lidar: Floats
+    T_vehicle_lidar: Floats | None
+    sigma_rad: float
+    sigma_m: float
+    limits: Floats
+    required: tuple[str, ...]
+    spin: SpinSense | None = None
+
+    def expectation(self, test: DriftTestParameters) -> Expectation:
+        """What estimates of this mount are expected to be while it has not moved."""
+        return expectation_of_stored(self.sigma_rad, self.sigma_m, test)
+
+    @property
+    def R_vehicle_cam(self) -> Floats:  # noqa: N802 - the name of the rotation
+        """Turns camera axes into vehicle axes, (3,3)."""
+        return se3.vehicle_axes(self.T_cam_lidar, self.T_vehicle_lidar)
+
+    @property
+    def up(self) -> Floats:
+        """Unit vector up, LiDAR frame."""
+        return np.asarray(self.R_vehicle_cam[2] @ self.T_cam_lidar[:3, :3], dtype=np.float64)
+
+    @property
+    def forward(self) -> Floats:
+        """Unit vector ahead (of the vehicle, else of the camera), LiDAR frame."""
+        return np.asarray(self.R_vehicle_cam[0] @ self.T_cam_lidar[:3, :3], dtype=np.float64)
+
+    def feigned(self, sweep: Straightened) -> Floats:
+        """Drift (6,), vehicle axes, that one sigma of error in a sweep's time would feign (FORMULAS G1)."""
+        R_vehicle_lidar = self.R_vehicle_cam @ self.T_cam_lidar[:3, :3]
+        if sweep.twist is None:
+            return np.array([0.0, 0.0, 0.0, sweep.sync_s * _ASSUMED_M_S, 0.0, 0.0])
+        centre = -self.T_cam_lidar[:3, :3].T @ self.T_cam_lidar[:3, 3]
+        velocity = sweep.twist.velocity + np.cross(sweep.twist.omega, centre)
+        motion = np.concatenate([R_vehicle_lidar @ sweep.twist.omega, R_vehicle_lidar @ velocity])
+        return np.asarray(sweep.sync_s * motion, dtype=np.float64)
+
+
+_ASSUMED_M_S = 10.0
+"""m/s ahead where the motion is not known: a street in town."""

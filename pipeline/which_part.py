@@ -184,7 +184,7 @@ def _log_likelihood(drifts: Floats, noise: Floats, moved: list[Floats]) -> float
     return float(logsumexp(logs) - np.log(len(logs)))
 
 
-_EXACT = 1e-3
+_EXACT = 1e-5
 """``MOVED_SIGMA``; nothing is known better, whatever a covariance says: it may be singular."""
 
 _ROUNDING = 1e-12

@@ -27,6 +27,7 @@ class Belief:
 
     Attributes:
         judgement: The test's result.
+        evidence: What was tested, against the expected extrinsic.
         T_estimated: float64 (4,4), the estimated extrinsic.
         edges: The edge witness, or None where it said nothing.
         lines: The line witness, or None likewise.
@@ -36,6 +37,7 @@ class Belief:
     """
 
     judgement: Judgement
+    evidence: Evidence
     T_estimated: Floats
     edges: EdgeSolution | None
     lines: LineSolution | None
@@ -97,6 +99,7 @@ def believe(
     )
     return Belief(
         judgement=drift_test.judge(evidence, expectation, mount.limits, test),
+        evidence=evidence,
         T_estimated=read_only(T_estimated),
         edges=edges,
         lines=lines,

@@ -10,7 +10,7 @@ from monitor.statements import Identity, Measured, status_of
 from monitor.status import AXIS_NAMES, Provenance, Rates
 from pipeline import fusion, verdict
 from pipeline.belief import Belief
-from pipeline.drift_test import Judgement
+from pipeline.drift_test import Evidence, Judgement
 from pipeline.mount import Mount
 from pipeline.records import CameraModel
 
@@ -62,7 +62,8 @@ def judged():
         contradicted=False,
     )
     testimony = fusion.Testimony(DRIFT, np.diag(np.full(6, 100.0)))
-    return Belief(judgement, np.eye(4), None, None, testimony, None, ())
+    evidence = Evidence(DRIFT, np.diag(spread**2), 0.1, 1.0, 9.0, persistent=True, frames=9)
+    return Belief(judgement, evidence, np.eye(4), None, None, testimony, None, ())
 
 
 def test_without_a_belief_every_number_is_null_but_the_limits():

@@ -109,3 +109,88 @@ def mean_absolute(
         ]
         found.append(float(np.mean(values)) if values else None)
     return found
+
+
+def clopper_pearson(hits: int, of: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact interval of a share (Clopper and Pearson 1934): at least ``level`` of such intervals hold it.
+
+    Args:
+        hits: How often.
+        of: Out of how many; without any the share may be anything.
+        level: Of confidence.
+    """
+    tail = 0.5 * (1.0 - level)
+    low = float(stats.beta.ppf(tail, hits, of - hits + 1)) if hits > 0 else 0.0
+    high = float(stats.beta.ppf(1.0 - tail, hits + 1, of - hits)) if hits < of else 1.0
+    return low, high
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """How well two kinds are told apart, each counted by itself.
+
+    Attributes:
+        accuracy: Mean of the two shares that were told rightly.
+        low: Both true shares lie above limits of this mean, at 95 %.
+        high: Below, likewise.
+    """
+
+    accuracy: float
+    low: float
+    high: float
+
+
+def balance(found: tuple[int, int], quiet: tuple[int, int]) -> Balance | None:
+    """Balanced accuracy with an interval.
+
+    Args:
+        found: Wrong ones that were told wrong, and wrong ones in all.
+        quiet: Healthy ones that were told healthy, and healthy ones in all.
+
+    Returns:
+        None where one of the two kinds is absent. The interval is that of two Clopper-Pearson intervals of
+        97.5 % each, which both hold at 95 % whatever ties them.
+    """
+    if found[1] == 0 or quiet[1] == 0:
+        return None
+    ends = [clopper_pearson(*one, level=0.975) for one in (found, quiet)]
+    return Balance(
+        accuracy=0.5 * (found[0] / found[1] + quiet[0] / quiet[1]),
+        low=0.5 * (ends[0][0] + ends[1][0]),
+        high=0.5 * (ends[0][1] + ends[1][1]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Roc:
+    """What a threshold on a score gives.
+
+    Attributes:
+        false: float64 (n,), ascending: share of healthy ones above the threshold.
+        found: float64 (n,), share of wrong ones above it.
+        area: Under the curve: chance that a wrong one scores above a healthy one, ties by half.
+        best: Highest balanced accuracy of any threshold, with hindsight.
+    """
+
+    false: Floats
+    found: Floats
+    area: float
+    best: float
+
+
+def roc(healthy: Sequence[float], wrong: Sequence[float]) -> Roc | None:
+    """Receiver operating characteristic of scores, from no alarm to nothing but alarms; None without both."""
+    if not healthy or not wrong:
+        return None
+    ones, others = np.sort(np.asarray(healthy)), np.sort(np.asarray(wrong))
+    thresholds = np.unique(np.concatenate([ones, others]))[::-1]
+    false, found = (
+        np.concatenate([[0.0], 1.0 - np.searchsorted(scores, thresholds, side="left") / len(scores)])
+        for scores in (ones, others)
+    )
+    return Roc(
+        false=false,
+        found=found,
+        area=float(np.trapezoid(found, false)),
+        best=float(np.max(0.5 * (found + 1.0 - false))),
+    )

@@ -1,0 +1,375 @@
+"""Trials of the verdict: what is done to a drive whose extrinsic is known, before it is watched.
+
+Each trial tells the watch a drive in other words (LiDAR axes turned and moved, the image cropped), so that
+nothing may rest on a file, and then makes one thing wrong: the stored extrinsic, its constancy, the stamps,
+the intrinsics, or nothing.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+
+import cv2
+import numpy as np
+
+from pipeline import se3
+from pipeline.cameras import project_unbounded, undistort
+from pipeline.mount import Mount
+from pipeline.records import AXES, CameraImage, CameraModel, Floats, FramePair, PointCloud, read_only
+
+Kind: TypeAlias = Literal[
+    "healthy",
+    "combined",
+    "single",
+    "compensating",
+    "ramp",
+    "vibration",
+    "time-offset",
+    "focal",
+    "offline",
+]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+SINGLE_DEG = (0.1, 0.25, 0.5, 1.0, 2.0)
+SINGLE_M = (0.01, 0.05, 0.10, 0.20)
+"""Steps along one axis."""
+
+PAIR_RANGE_M = 20.0
+"""m; compensating pairs leave the bearing at this range as it was (PROBE 3)."""
+PAIR_DEG = (0.25, 0.5, 1.0)
+"""Angle of a compensating pair; its shift follows from the range."""
+
+COMBINED_DEG = (0.5, 1.2)
+COMBINED_M = (0.1, 0.2)
+"""Of a wrong extrinsic: turn about a random axis, and shift of the camera in a random direction (PROBE 5)."""
+
+RAMP_DEG = (0.25, 0.5, 1.0)
+"""Turn that has grown evenly by the end of the drive."""
+
+SHAKE_DEG = (0.1, 0.2, 0.4)
+"""Root mean square angle of a camera that shakes faster than frames follow each other."""
+
+LATE_MS = (10, 20, 50, 100)
+"""By which images bear wrong stamps."""
+
+FOCAL_SHARE = (0.005, 0.01, 0.02)
+"""By which the stored focal length is wrong."""
+
+OFFLINE_DEG = (1.0, 3.0, 5.0)
+OFFLINE_M = 0.05
+"""Turn about, and shift along, each axis of the camera: the table of a published offline check."""
+
+TURNED_DEG, MOVED_M = 1.5, 0.3
+"""How far LiDAR axes are turned about a random axis and moved in a random direction, at most."""
+
+CROPPED_PX = 12
+"""px that are cut off at each side of the image, at most."""
+
+_GRID_PX = 16
+"""px between the places where a turned camera's rays are followed; between them the shift is linear to a
+hundredth of a px."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """What is made wrong in one run.
+
+    Attributes:
+        kind: Of trial.
+        label: Which amount, for the tables; trials of one label are alike.
+        number: Among the trials of this kind.
+        drift: float64 (6,), vehicle axes, rad and m: motion of the mount since the extrinsic was
+            stored, at the end of the drive.
+        ramp: Whether the drift grows evenly over the drive; else it is there from the first frame.
+        shake_rad: Root mean square angle by which the camera shakes, rad.
+        late_ns: Images bear stamps that are later by so much, ns.
+        focal: The stored focal length is so many times the true one.
+    """
+
+    kind: Kind
+    label: str
+    number: int
+    drift: Floats
+    ramp: bool = False
+    shake_rad: float = 0.0
+    late_ns: int = 0
+    focal: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "drift", read_only(self.drift))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Staged:
+    """A drive as the watch is told it.
+
+    Attributes:
+        mount: With the stored extrinsic and intrinsics.
+        frames: Its frames, made while they are asked for.
+    """
+
+    mount: Mount
+    frames: Iterator[FramePair]
+
+
+_Draw: TypeAlias = Callable[[Mount, np.random.Generator], dict[str, object]]
+"""The fields of a trial other than kind, label and number."""
+
+
+def count(kind: Kind, runs: int) -> int:
+    """How many trials there are of a kind when at least ``runs`` are wanted: of every label equally many."""
+    labels = len(_CELLS[kind])
+    return math.ceil(runs / labels) * labels
+
+
+def labels_of(kind: Kind) -> tuple[str, ...]:
+    """The labels of a kind, in the order of the tables."""
+    return tuple(_CELLS[kind])
+
+
+def draw(kind: Kind, number: int, true: Mount, rng: np.random.Generator) -> Trial:
+    """Trial ``number`` of a kind.
+
+    Args:
+        kind: Of trial.
+        number: From 0; labels take turns.
+        true: The mount with its true extrinsic.
+        rng: Of this trial.
+    """
+    label = labels_of(kind)[number % len(_CELLS[kind])]
+    fields = {"drift": np.zeros(6)} | _CELLS[kind][label](true, rng)
+    return Trial(kind, label, number, **fields)  # type: ignore[arg-type]  # the draws below give its fields
+
+
+def stage(trial: Trial, true: Mount, frames: Sequence[FramePair], rng: np.random.Generator) -> Staged:
+    """The drive of a trial: in other words, and with one thing wrong.
+
+    Args:
+        trial: What is wrong.
+        true: The mount with its true extrinsic, constant over ``frames``.
+        frames: The drive.
+        rng: Of this trial's axes, crop and shaking.
+    """
+    G = _axes_elsewhere(rng)
+    left, top, right, bottom = (int(n) for n in rng.integers(0, CROPPED_PX + 1, 4))
+    turns = _shaking(trial.shake_rad, len(frames), rng)
+    stored = true.T_cam_lidar
+    if not trial.ramp:
+        T = true.T_vehicle_lidar
+        stored = se3.stored_before(stored, trial.drift, None if T is None else T[:3, :3])
+    mount = dataclasses.replace(
+        true,
+        T_cam_lidar=stored @ se3.inverse(G),
+        T_vehicle_lidar=None if true.T_vehicle_lidar is None else true.T_vehicle_lidar @ se3.inverse(G),
+        camera=_stored_camera(true.camera, (left, top, right, bottom), trial.focal),
+    )
+
+    def told() -> Iterator[FramePair]:
+        for k, pair in enumerate(_late(frames, trial.late_ns)):
+            pixels = pair.image.pixels if turns is None else _turned(pair.image.pixels, true.camera, turns[k])
+            height, width = pixels.shape[:2]
+            moved = G
+            if trial.ramp:
+                share = k / max(len(frames) - 1, 1)
+                T_now = se3.displaced(true.T_cam_lidar, share * trial.drift, true.R_vehicle_cam)
+                moved = G @ se3.inverse(T_now) @ true.T_cam_lidar
+            yield dataclasses.replace(
+                pair,
+                cloud=_mapped(pair.cloud, moved),
+                image=CameraImage(np.ascontiguousarray(pixels[top : height - bottom, left : width - right])),
+            )
+
+    return Staged(mount, told())
+
+
+def _axes_elsewhere(rng: np.random.Generator) -> Floats:
+    """T_new_old (4,4) of the axes in which LiDAR points are told."""
+    turn = _direction(rng) * math.radians(TURNED_DEG) * rng.uniform()
+    return se3.transform(se3.exp_so3(turn), _direction(rng) * MOVED_M * rng.uniform())
+
+
+def _stored_camera(true: CameraModel, crop: tuple[int, int, int, int], focal: float) -> CameraModel:
+    left, top, right, bottom = crop
+    K = true.K.copy()
+    K[:2, :2] *= focal
+    K[:2, 2] -= (left, top)
+    width, height = true.width - left - right, true.height - top - bottom
+    return dataclasses.replace(true, K=K, width=width, height=height)
+
+
+def _mapped(cloud: PointCloud, T: Floats) -> PointCloud:
+    return dataclasses.replace(cloud, xyz=se3.apply(T, cloud.xyz).astype(np.float32))
+
+
+def _shaking(rms: float, frames: int, rng: np.random.Generator) -> Floats | None:
+    """Turn of the camera at each exposure (frames,3), rad, mean zero; None where it does not shake.
+
+    Slower frames see a fast shake as turns that have nothing to do with each other.
+    """
+    if rms == 0.0:
+        return None
+    turns = rng.normal(0.0, rms / math.sqrt(3.0), (frames, 3))
+    return np.asarray(turns - turns.mean(axis=0), dtype=np.float64)
+
+
+def _turned(pixels: np.ndarray, camera: CameraModel, turn: Floats) -> np.ndarray:
+    """What the camera sees when it is turned about its centre by ``turn`` (3,), rad, camera axes."""
+    columns = np.append(np.arange(0, camera.width - 1, _GRID_PX), camera.width - 1)
+    rows = np.append(np.arange(0, camera.height - 1, _GRID_PX), camera.height - 1)
+    u, v = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    rays = np.column_stack([undistort(camera, uv), np.ones(len(uv))])
+    before, seen = project_unbounded(camera, rays @ se3.exp_so3(turn))
+    # Corners that the lens model does not reach stay where they are.
+    shift = np.where(seen[:, None] & np.isfinite(before), before - uv, 0.0).reshape(*u.shape, 2)
+    across, down = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    # Where in the grid each pixel lies; its last row and column are nearer to their neighbours.
+    gx = np.interp(across[0], columns, np.arange(len(columns)))
+    gy = np.interp(down[:, 0], rows, np.arange(len(rows)))
+    x, y = (a.astype(np.float32) for a in np.meshgrid(gx, gy))
+    full = cv2.remap(shift.astype(np.float32), x, y, cv2.INTER_LINEAR)
+    return cv2.remap(
+        np.asarray(pixels),
+        (across + full[..., 0]).astype(np.float32),
+        (down + full[..., 1]).astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+
+def _late(frames: Sequence[FramePair], late_ns: int) -> list[FramePair]:
+    """The pairs that are made when images bear stamps that are ``late_ns`` too late.
+
+    A sweep goes with the image whose stamp now lies where that of its own image lay, each with its nearest;
+    the sweeps at the end for which there is none are left out.
+    """
+    if late_ns == 0:
+        return list(frames)
+    stamps = np.array([frame.image_stamp_ns for frame in frames], dtype=np.int64)
+    apart = np.abs(stamps[None, :] + late_ns - stamps[:, None])
+    images, sweeps = apart.argmin(axis=1), apart.argmin(axis=0)
+    return [
+        dataclasses.replace(
+            frames[i], image=frames[j].image, image_stamp_ns=frames[j].image_stamp_ns + late_ns
+        )
+        for i, j in enumerate(images.tolist())
+        if sweeps[j] == i
+    ]
+
+
+def _direction(rng: np.random.Generator) -> Floats:
+    """Unit vector (3,), every direction equally likely."""
+    v = rng.normal(size=3)
+    return np.asarray(v / np.linalg.norm(v), dtype=np.float64)
+
+
+def _healthy(true: Mount, rng: np.random.Generator) -> dict[str, object]:
+    del true, rng
+    return {}
+
+
+def _combined(true: Mount, rng: np.random.Generator) -> dict[str, object]:
+    """Turned about a random axis and moved in a random direction."""
+    turn = _direction(rng) * math.radians(rng.uniform(*COMBINED_DEG))
+    return {"drift": _moved(true, turn, _direction(rng) * rng.uniform(*COMBINED_M))}
+
+
+def _moved(true: Mount, turn: Floats, shift: Floats) -> Floats:
+    """Drift (6,) since an extrinsic that was off the true one.
+
+    Args:
+        true: The mount with its true extrinsic.
+        turn: float64 (3,), rotation vector, rad, camera axes.
+        shift: float64 (3,), of the camera centre, m, camera axes.
+    """
+    R = true.T_cam_lidar[:3, :3]
+    centre = -R.T @ true.T_cam_lidar[:3, 3] + R.T @ shift
+    R_stored = se3.exp_so3(turn) @ R
+    stored = se3.transform(R_stored, -R_stored @ centre)
+    R_vehicle_cam = se3.vehicle_axes(stored, true.T_vehicle_lidar)
+    return se3.mount_drift(stored, true.T_cam_lidar, R_vehicle_cam)
+
+
+def _constant(**fields: object) -> _Draw:
+    def give(true: Mount, rng: np.random.Generator) -> dict[str, object]:
+        del true, rng
+        return dict(fields)
+
+    return give
+
+
+def _one_axis() -> dict[str, _Draw]:
+    cells: dict[str, _Draw] = {}
+    for axis, name in enumerate(AXES):
+        for amount in SINGLE_DEG if axis < 3 else SINGLE_M:
+            for sign in (1.0, -1.0):
+                drift = np.zeros(6)
+                drift[axis] = sign * (math.radians(amount) if axis < 3 else amount)
+                cells[f"{name} {sign * amount:+g} {'deg' if axis < 3 else 'm'}"] = _constant(drift=drift)
+    return cells
+
+
+def _pairs() -> dict[str, _Draw]:
+    cells: dict[str, _Draw] = {}
+    for angle, shift, slope in (("pitch", "up", 1.0), ("yaw", "left", -1.0)):
+        for amount in PAIR_DEG:
+            for sign in (1.0, -1.0):
+                drift = np.zeros(6)
+                drift[AXES.index(angle)] = sign * math.radians(amount)
+                drift[AXES.index(shift)] = slope * PAIR_RANGE_M * sign * math.radians(amount)
+                metres = drift[AXES.index(shift)]
+                cells[f"{angle} {sign * amount:+g} deg, {shift} {metres:+.3f} m"] = _constant(drift=drift)
+    return cells
+
+
+def _ramps() -> dict[str, _Draw]:
+    def ramp(amount: float) -> _Draw:
+        def give(true: Mount, rng: np.random.Generator) -> dict[str, object]:
+            del true
+            drift = np.zeros(6)
+            drift[int(rng.integers(3))] = rng.choice((-1.0, 1.0)) * math.radians(amount)
+            return {"drift": drift, "ramp": True}
+
+        return give
+
+    return {f"{amount:g} deg by the end": ramp(amount) for amount in RAMP_DEG}
+
+
+def _offline() -> dict[str, _Draw]:
+    def wrong(axis: int, turn_deg: float, shift_m: float) -> _Draw:
+        def give(true: Mount, rng: np.random.Generator) -> dict[str, object]:
+            along = float(rng.choice((-1.0, 1.0))) * np.eye(3)[axis]
+            return {"drift": _moved(true, math.radians(turn_deg) * along, shift_m * along)}
+
+        return give
+
+    cells = {
+        f"about {name} {deg:g} deg": wrong(axis, deg, 0.0)
+        for axis, name in enumerate("xyz")
+        for deg in OFFLINE_DEG
+    }
+    return cells | {
+        f"along {name} {OFFLINE_M:g} m": wrong(axis, 0.0, OFFLINE_M) for axis, name in enumerate("xyz")
+    }
+
+
+_CELLS: Mapping[Kind, Mapping[str, _Draw]] = {
+    "healthy": {"nothing": _healthy},
+    "combined": {"all axes": _combined},
+    "single": _one_axis(),
+    "compensating": _pairs(),
+    "ramp": _ramps(),
+    "vibration": {f"{deg:g} deg rms": _constant(shake_rad=math.radians(deg)) for deg in SHAKE_DEG},
+    "time-offset": {
+        f"{sign * ms:+d} ms": _constant(late_ns=sign * ms * 1_000_000) for ms in LATE_MS for sign in (1, -1)
+    },
+    "focal": {
+        f"{100 * sign * share:+g} %": _constant(focal=1.0 + sign * share)
+        for share in FOCAL_SHARE
+        for sign in (1, -1)
+    },
+    "offline": _offline(),
+}
+"""Label -> what it draws, of each kind."""

@@ -11,6 +11,7 @@ from monitor.status import (
     AXIS_NAMES,
     AxisDrift,
     AxisValues,
+    Consequence,
     Drift,
     Frames,
     Onset,
@@ -26,6 +27,7 @@ from monitor.status import (
 )
 from pipeline import verdict
 from pipeline.belief import Belief
+from pipeline.consequence import consequences
 from pipeline.fusion import Testimony
 from pipeline.mount import Mount
 from pipeline.records import Floats
@@ -104,6 +106,7 @@ def status_of(
         else Onset(stamp_ns=onset.stamp_ns, from_ns=onset.from_ns, to_ns=onset.to_ns),
         severity=memory.severity,
         drift=_drift(mount, memory, belief),
+        consequence=_consequence(mount, belief),
         witnesses=_witnesses(belief),
         window=Window(
             frames=len(stamps),
@@ -153,6 +156,26 @@ def _drift(mount: Mount, memory: verdict.Memory, belief: Belief | None) -> Drift
             last_seen_ns=memory.last_seen_ns[index],
         )
     return Drift(axes="camera" if mount.T_vehicle_lidar is None else "vehicle", relative_to="stored", **axes)
+
+
+def _consequence(mount: Mount, belief: Belief | None) -> tuple[Consequence, ...]:
+    """What the drift told does to perception; nothing of an estimate that is chance."""
+    if belief is None or belief.judgement.blind:
+        return ()
+    drift, covariance = belief.judgement.drift, belief.evidence.covariance
+    return tuple(
+        Consequence(
+            range_m=at.range_m,
+            shift_px=finite(at.shift_px),
+            sigma_px=finite(at.sigma_px),
+            worst_px=finite(at.worst_px),
+            left_m=at.left_m,
+            sigma_left_m=at.sigma_left_m,
+            up_m=at.up_m,
+            sigma_up_m=at.sigma_up_m,
+        )
+        for at in consequences(mount.camera, mount.R_vehicle_cam, drift, covariance)
+    )
 
 
 def _witnesses(belief: Belief | None) -> Witnesses:

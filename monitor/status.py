@@ -141,6 +141,21 @@ class Drift(_Part):
         return axis
 
 
+class Consequence(_Part):
+    """What the drift does at one distance from the camera; null where nothing projects."""
+
+    range_m: NonNegative
+    shift_px: NonNegative | None = Field(description="how far a point on the optical axis moves in the image")
+    sigma_px: NonNegative | None = Field(description="standard deviation of its place, largest direction")
+    worst_px: NonNegative | None = Field(description="largest move of a point anywhere in the image")
+    left_m: FiniteFloat = Field(
+        description="how far left of where the stored extrinsic puts it a thing on the optical axis stands"
+    )
+    sigma_left_m: NonNegative
+    up_m: FiniteFloat = Field(description="how far above, likewise")
+    sigma_up_m: NonNegative
+
+
 class AxisValues(_Part):
     """One number per axis, degrees and metres."""
 
@@ -233,6 +248,9 @@ class Status(_Part):
     onset: Onset | None
     severity: Literal["minor", "major"] | None
     drift: Drift
+    consequence: tuple[Consequence, ...] = Field(
+        default=(), description="what the drift does at several distances; none while nothing is known"
+    )
     witnesses: Witnesses
     window: Window
     frames: Frames

@@ -104,7 +104,8 @@ def verdict_sentence(status: Status) -> str:
     since = stamp_text(status.since_ns)
     bodies: dict[State, str] = {
         "healthy": f"healthy since {since}: a drift beyond the limits is excluded for {watched}",
-        "drifted": f"drifted ({status.severity or 'minor'}): {moved}, {_onset_text(status)}",
+        "drifted": f"drifted ({status.severity or 'minor'}): {moved}, {_onset_text(status)}"
+        f"{consequence_text(status)}",
         "suspect": f"suspect since {since}: {moved or 'the evidence'} is not yet sure",
         "unobservable": f"without a statement since {since}: {_clause(status.reason)}",
         "stale": f"stale since {since}: {_clause(status.reason)}",
@@ -113,6 +114,26 @@ def verdict_sentence(status: Status) -> str:
     }
     checked = status.state in ("healthy", "drifted", "suspect", "unobservable")
     return f"{status.pair} is {bodies[status.state]}{'; ' + unchecked_text(status) if checked else ''}."
+
+
+_NOTICED_M = 0.01
+"""m; a misplacement below it is not worth a clause."""
+
+
+def consequence_text(status: Status) -> str:
+    """What the drift does at the middle one of the distances told, one clause; empty: nothing is known."""
+    if not status.consequence:
+        return ""
+    at = status.consequence[len(status.consequence) // 2]
+    far, sideways = max((abs(at.left_m), True), (abs(at.up_m), False))
+    parts = []
+    if at.worst_px is not None:
+        parts.append(f"points lie up to {at.worst_px:.1f} px off")
+    if far >= _NOTICED_M:
+        way = ("to the left of" if at.left_m > 0 else "to the right of") if sideways else None
+        way = way or ("above" if at.up_m > 0 else "below")
+        parts.append(f"things stand {far:.2f} m {way} where they are put")
+    return f"; {at.range_m:.0f} m away {' and '.join(parts)}" if parts else ""
 
 
 def _onset_text(status: Status) -> str:

@@ -262,6 +262,7 @@ def _tables(status: Status) -> list[dict[str, Any]]:
                 ("edges on", _figure(rates.edges_hz, "Hz")),
             ],
         },
+        *_consequence_tables(status),
         *_witness_tables(status),
         {
             "title": "Time per frame (median, 95 %)",
@@ -275,6 +276,22 @@ def _tables(status: Status) -> list[dict[str, Any]]:
                 ("software", status.software),
             ],
         },
+    ]
+
+
+def _consequence_tables(status: Status) -> list[dict[str, Any]]:
+    """What the drift does at each distance; nothing where nothing is known."""
+    return [
+        {
+            "title": f"What the drift does {at.range_m:.0f} m away",
+            "rows": [
+                ("middle of the image", f"{_figure(at.shift_px, 'px')} ± {_figure(at.sigma_px, 'px')}"),
+                ("anywhere in the image", f"up to {_figure(at.worst_px, 'px')}"),
+                ("things stand left", f"{at.left_m:+.3f} ± {at.sigma_left_m:.3f} m"),
+                ("things stand above", f"{at.up_m:+.3f} ± {at.sigma_up_m:.3f} m"),
+            ],
+        }
+        for at in status.consequence
     ]
 
 

@@ -1,5 +1,6 @@
 """Belief and memory as a status: units, names, and nulls where nothing is known."""
 
+import dataclasses
 import math
 from collections import Counter
 
@@ -62,7 +63,9 @@ def judged():
         contradicted=False,
     )
     testimony = fusion.Testimony(DRIFT, np.diag(np.full(6, 100.0)))
-    evidence = Evidence(DRIFT, np.diag(spread**2), 0.1, 1.0, 9.0, persistent=True, frames=9)
+    evidence = Evidence(
+        DRIFT, np.diag(np.where(known, 0.01, 10.0) ** 2), 0.1, 1.0, 9.0, persistent=True, frames=9
+    )
     return Belief(judgement, evidence, np.eye(4), None, None, testimony, None, ())
 
 
@@ -100,3 +103,16 @@ def test_the_window_is_that_of_the_edges_else_of_the_lines():
     assert said(window_ns=(second, 2 * second), lines_ns=(0,)).window.span_s == 1.0
     window = said(lines_ns=(0, second, 3 * second)).window
     assert (window.frames, window.span_s) == (3, 3.0)
+
+
+def test_what_the_drift_does_is_told_at_every_distance_and_not_of_chance():
+    near, middle, far = said(judged()).consequence
+    assert (near.range_m, middle.range_m, far.range_m) == (10.0, 30.0, 80.0)
+    # +yaw turns left and -0.05 m is to the right: sine of the angle times the range, less the shift.
+    assert middle.left_m == pytest.approx(30.0 * math.sin(DRIFT[2]) - 0.05, abs=1e-3)
+    assert middle.up_m == pytest.approx(-30.0 * math.sin(DRIFT[1]) + 0.06, abs=1e-3)
+    assert far.sigma_left_m == pytest.approx(0.01 * math.hypot(80.0, 1.0), rel=1e-3)
+    assert far.sigma_up_m == pytest.approx(math.hypot(0.8, 10.0), rel=1e-2)
+    belief = judged()
+    blind = dataclasses.replace(belief, judgement=dataclasses.replace(belief.judgement, blind=True))
+    assert said().consequence == said(blind).consequence == ()

@@ -47,6 +47,18 @@ STATUS = {
     "onset": {"stamp_ns": 1, "from_ns": 0, "to_ns": 2},
     "severity": None,
     "drift": {"axes": "vehicle", "relative_to": "stored"} | dict.fromkeys(AXES, AXIS),
+    "consequence": [
+        {
+            "range_m": 30.0,
+            "shift_px": 4.0,
+            "sigma_px": 0.5,
+            "worst_px": None,
+            "left_m": -0.2,
+            "sigma_left_m": 0.02,
+            "up_m": 0.0,
+            "sigma_up_m": 0.02,
+        }
+    ],
     "witnesses": {"lines": {"drift": VALUES, "sigma": VALUES, "chi2": 1.0, "frames": 3}, "edges": None},
     "window": {"frames": 3, "span_s": 1.0, "lines_lane": 1, "lines_pole": 2, "lines_structure": 0},
     "frames": {"received": 9, "used": 3, "dropped": {"no_partner": 6}},

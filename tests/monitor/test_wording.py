@@ -180,3 +180,35 @@ def test_an_axis_that_moved_is_not_among_the_unchecked():
 def test_all_checked_is_said_only_when_all_are_monitored():
     assert unchecked_text(status()) == "all six axes were checked"
     assert unchecked_text(status(axes={"roll": BLUNT})).startswith("not checked: roll")
+
+
+def at_30_m(**values):
+    at = {
+        "range_m": 30.0,
+        "shift_px": 4.0,
+        "sigma_px": 0.5,
+        "worst_px": 6.24,
+        "left_m": 0.0,
+        "sigma_left_m": 0.0,
+        "up_m": 0.0,
+        "sigma_up_m": 0.0,
+    }
+    return (at | values,)
+
+
+@pytest.mark.parametrize(
+    ("values", "clause"),
+    [
+        ({"left_m": 0.26}, "points lie up to 6.2 px off and things stand 0.26 m to the left of where"),
+        ({"left_m": -0.26, "up_m": 0.1}, "and things stand 0.26 m to the right of where they are put"),
+        ({"up_m": 0.3}, "and things stand 0.30 m above where they are put"),
+        ({"up_m": -0.3, "worst_px": None}, "; 30 m away things stand 0.30 m below where they are put"),
+        ({}, "; 30 m away points lie up to 6.2 px off; "),
+    ],
+)
+def test_a_drift_says_what_it_does_30_m_away(values, clause):
+    told = verdict_sentence(status("drifted", {"yaw": {"value": 0.8}}, consequence=at_30_m(**values)))
+    assert clause in told
+    assert "30 m" not in verdict_sentence(status("healthy", consequence=at_30_m(**values)))
+    nothing = at_30_m(worst_px=None)
+    assert "30 m" not in verdict_sentence(status("drifted", {"yaw": {"value": 0.8}}, consequence=nothing))

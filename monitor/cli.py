@@ -81,6 +81,9 @@ def calibwatch(*, verbose: bool) -> None:
         format="%(levelname)s: %(message)s",
         stream=sys.stderr,
     )
+    from monitor.memory import keep_freed  # noqa: PLC0415 - not needed for --help
+
+    keep_freed()
 
 
 def main(arguments: list[str] | None = None) -> None:

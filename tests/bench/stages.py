@@ -13,6 +13,7 @@ import numpy as np
 
 from monitor.daemon import mount_of
 from monitor.intake import Intake
+from monitor.memory import keep_freed
 from monitor.messages import Message, decode
 from monitor.model_file import model_bytes
 from monitor.preparation import prepare
@@ -95,6 +96,7 @@ class _Stopwatch:
 
 def measure(location: str, threads: int) -> Measured:
     """All stages of the first pair of a recording, and what its alternatives cost."""
+    keep_freed()
     cv2.setNumThreads(threads)
     rig = prepare(location, None, None).rig
     rig = dataclasses.replace(rig, pairs=rig.pairs[:1])

@@ -109,3 +109,50 @@ def progress_line(what: str) -> Callable[[int], None] | None:
         click.echo(f"\r{what} {count}", nl=False, err=True)
 
     return show
+
+
+def output_options(function: Callable[..., object]) -> Callable[..., object]:
+    """``--seed``, ``--json`` and ``--out`` of experiments."""
+    function = click.option(
+        "--out",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="Folder for the tables (.md), the figures (.json) and the picture (.png).",
+    )(function)
+    function = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")(function)
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**32 - 1),
+        default=0,
+        show_default=True,
+        help="Seed of whatever is drawn.",
+    )(function)
+
+
+def made(out: Path | None) -> Path | None:
+    """The folder of ``--out``, made before anything is measured for it."""
+    from monitor.mask_tables import made  # noqa: PLC0415 - loaded with the rest
+
+    return None if out is None else made(out)
+
+
+def deliver(
+    folder: Path | None, name: str, text: str, document: str, picture: bytes | None, *, as_json: bool
+) -> None:
+    """Writes what an experiment gave into its folder, if any, and prints it."""
+    from monitor.plk_tables import write  # noqa: PLC0415 - loaded with the rest
+
+    if folder is not None:
+        write(folder, name, text, document, picture)
+    click.echo(document if as_json else text)
+
+
+def progress(name: str, done: int, of: int) -> None:
+    """Rewrites one line on stderr, on a terminal only."""
+    if sys.stderr.isatty():
+        click.echo(f"\r\x1b[K{name}: {done} of {of}", nl=False, err=True)
+
+
+def clear() -> None:
+    """Takes that line away."""
+    if sys.stderr.isatty():
+        click.echo("\r\x1b[K", nl=False, err=True)

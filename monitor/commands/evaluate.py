@@ -1,7 +1,6 @@
 """``calibwatch evaluate``: measured on data whose truth is known."""
 
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from monitor import commands
+from monitor.commands import evaluate_drift
 
 if TYPE_CHECKING:
     from monitor.evaluated_frames import EvaluatedFrames
@@ -22,6 +22,9 @@ LONGEST_SIDE = 1280
 )
 def command() -> None:
     """Measure calibwatch on data whose truth is known."""
+
+
+command.add_command(evaluate_drift.command)
 
 
 @command.command(
@@ -77,36 +80,19 @@ def masks_command(
     sweep = as_json or out is not None
     options = Options(split, crf=not no_crf, sweep=sweep, longest_side=longest_side, threads=threads)
     folder = None if out is None else made(out)
-    found = evaluate(folders, model, options, SystemClock(), _progress)
-    _clear()
+    found = evaluate(folders, model, options, SystemClock(), commands.progress)
+    commands.clear()
     if folder is not None:
         write(found, folder)
     click.echo(found.model_dump_json(indent=1) if as_json else tables(found))
     return 0
 
 
-def _output_options(function: Callable[..., object]) -> Callable[..., object]:
-    """``--seed``, ``--json`` and ``--out`` of experiments."""
-    function = click.option(
-        "--out",
-        type=click.Path(path_type=Path, file_okay=False),
-        help="Folder for the tables (.md), the figures (.json) and the picture (.png).",
-    )(function)
-    function = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")(function)
-    return click.option(
-        "--seed",
-        type=click.IntRange(0, 2**32 - 1),
-        default=0,
-        show_default=True,
-        help="Seed of whatever is drawn.",
-    )(function)
-
-
 def _plk_options(runs: int) -> Callable[[Callable[..., object]], Callable[..., object]]:
     """``--runs``, ``--seed``, ``--json`` and ``--out`` of the experiments of PLK-Calib."""
 
     def add(function: Callable[..., object]) -> Callable[..., object]:
-        function = _output_options(function)
+        function = commands.output_options(function)
         return click.option(
             "--runs",
             type=click.IntRange(1, 100_000),
@@ -122,7 +108,7 @@ def _frame_options(starts: int) -> Callable[[Callable[..., object]], Callable[..
     """What chooses frames and starts: ``--simulated``, ``--frames``, ``--starts``, ``--seed`` and outputs."""
 
     def add(function: Callable[..., object]) -> Callable[..., object]:
-        function = _output_options(function)
+        function = commands.output_options(function)
         function = commands.model_option(function)
         function = click.option(
             "--starts",
@@ -163,10 +149,12 @@ def table_command(*, runs: int, seed: int, as_json: bool, out: Path | None) -> i
     from monitor.plk_evaluation import table  # noqa: PLC0415 - numpy is not needed for --help
     from monitor.plk_tables import table_text  # noqa: PLC0415 - likewise
 
-    folder = _made(out)
-    found = table(runs, seed, _progress)
-    _clear()
-    _deliver(folder, "plk-table1", table_text(found), found.model_dump_json(indent=1), None, as_json=as_json)
+    folder = commands.made(out)
+    found = table(runs, seed, commands.progress)
+    commands.clear()
+    commands.deliver(
+        folder, "plk-table1", table_text(found), found.model_dump_json(indent=1), None, as_json=as_json
+    )
     return 0 if found.met else 1
 
 
@@ -183,11 +171,13 @@ def boxes_command(*, runs: int, seed: int, as_json: bool, out: Path | None) -> i
     from monitor.plk_evaluation import box_plots  # noqa: PLC0415 - numpy is not needed for --help
     from monitor.plk_tables import box_picture, box_text  # noqa: PLC0415 - likewise
 
-    folder = _made(out)
-    found = box_plots(runs, seed, _progress)
-    _clear()
+    folder = commands.made(out)
+    found = box_plots(runs, seed, commands.progress)
+    commands.clear()
     picture = None if folder is None else box_picture(found)
-    _deliver(folder, "plk-fig5", box_text(found), found.model_dump_json(indent=1), picture, as_json=as_json)
+    commands.deliver(
+        folder, "plk-fig5", box_text(found), found.model_dump_json(indent=1), picture, as_json=as_json
+    )
     return 0
 
 
@@ -205,11 +195,11 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
     from monitor.plk_evaluation import offsets  # noqa: PLC0415 - numpy is not needed for --help
     from monitor.plk_tables import offsets_picture, offsets_text  # noqa: PLC0415 - likewise
 
-    folder = _made(out)
-    found = offsets(runs, seed, _progress)
-    _clear()
+    folder = commands.made(out)
+    found = offsets(runs, seed, commands.progress)
+    commands.clear()
     picture = None if folder is None else offsets_picture(found)
-    _deliver(
+    commands.deliver(
         folder, "plk-fig6", offsets_text(found), found.model_dump_json(indent=1), picture, as_json=as_json
     )
     return 0
@@ -288,15 +278,15 @@ def dataset_command(
     from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
 
     chosen = _frames_of(places, simulated, frames, seed, reference_sigma, set_sigmas)
-    folder = _made(out)
+    folder = commands.made(out)
     segmenter = open_segmenter(model, 1)
     told = None if prior_sigma is None else PriorSigma(math.radians(prior_sigma[0]), prior_sigma[1])
     options = Options(starts, rotation, translation, seed, told)
-    found = evaluate(chosen, segmenter, options, SystemClock(), _progress)
-    _clear()
+    found = evaluate(chosen, segmenter, options, SystemClock(), commands.progress)
+    commands.clear()
     picture = None if folder is None else dataset_picture(found)
     text, document = dataset_text(found), found.model_dump_json(indent=1)
-    _deliver(folder, "dataset", text, document, picture, as_json=as_json)
+    commands.deliver(folder, "dataset", text, document, picture, as_json=as_json)
     return 0
 
 
@@ -331,11 +321,13 @@ def basin_command(
     from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
 
     chosen = _frames_of(places, simulated, frames, seed)
-    folder = _made(out)
-    found = evaluate(chosen, starts, seed, open_segmenter(model, 1), SystemClock(), _progress)
-    _clear()
+    folder = commands.made(out)
+    found = evaluate(chosen, starts, seed, open_segmenter(model, 1), SystemClock(), commands.progress)
+    commands.clear()
     picture = None if folder is None else basin_picture(found)
-    _deliver(folder, "basin", basin_text(found), found.model_dump_json(indent=1), picture, as_json=as_json)
+    commands.deliver(
+        folder, "basin", basin_text(found), found.model_dump_json(indent=1), picture, as_json=as_json
+    )
     return 0
 
 
@@ -366,29 +358,3 @@ def _frames_of(
 
 def _warn(note: str) -> None:
     click.echo(f"warning: {note}", err=True)
-
-
-def _made(out: Path | None) -> Path | None:
-    from monitor.mask_tables import made  # noqa: PLC0415 - loaded with the rest
-
-    return None if out is None else made(out)
-
-
-def _deliver(
-    folder: Path | None, name: str, text: str, document: str, picture: bytes | None, *, as_json: bool
-) -> None:
-    from monitor.plk_tables import write  # noqa: PLC0415 - loaded with the rest
-
-    if folder is not None:
-        write(folder, name, text, document, picture)
-    click.echo(document if as_json else text)
-
-
-def _progress(name: str, done: int, of: int) -> None:
-    if sys.stderr.isatty():
-        click.echo(f"\r\x1b[K{name}: {done} of {of}", nl=False, err=True)
-
-
-def _clear() -> None:
-    if sys.stderr.isatty():
-        click.echo("\r\x1b[K", nl=False, err=True)

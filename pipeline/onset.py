@@ -1,8 +1,8 @@
-"""When a drift began: the change point in a series of scores, with the interval that holds it (DESIGN: onset).
+"""When a drift began: the change point in a series of scores, with the interval that holds it.
 
-A score is 0 where the mount stands as it is expected to and 1 where it stands as it is estimated now. Its level
-before and after the change is free, its noise correlated in time. The likelihood is profiled over levels, noise
-and shape (a step, or growth that takes time); the interval is what it does not exclude.
+A score is 0 where the mount stands as it is expected to and 1 where it stands as it is estimated now. Its
+level before and after the change is free, its noise correlated in time. The likelihood is profiled over
+levels, noise and shape (a step, or growth that takes time); the interval is what it does not exclude.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ class OnsetParameters:
     """How sure the interval is, and which noise is allowed for.
 
     Attributes:
-        excluded: Twice the loss of log likelihood at which a moment of a step is excluded. For a step the loss
-            follows the square of ``1 - exp(-x/2)`` (two random walks from the true moment): 95 %. For
-            growth, with a beginning and an end, chi-square of two degrees makes it 97 %.
+        excluded: Twice the loss of log likelihood at which a moment is excluded. For a step the loss follows
+            the square of ``1 - exp(-x/2)`` (two random walks from the true moment): 95 %. For growth, with
+            a beginning and an end, chi-square of two degrees makes it 97 %.
         gradual: Twice the gain of log likelihood by which growth must explain the scores better than a step:
             chi-square of one degree at 1e-3; who reads 'gradual' looks for a loose bolt, not for a blow.
         least: Scores below which nothing is said: two levels and a noise are to be told from them.
@@ -38,29 +38,29 @@ class OnsetParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class ChangePoint:
-    """When a series changed, ns.
+class Onset:
+    """When a drift began: most likely stamp, and the interval that holds it, ns.
+
+    A most likely stamp at the beginning of the interval says that nothing before it was free of the drift.
 
     Attributes:
-        stamp_ns: Most likely moment; ``from_ns`` where nothing in the series was surely free of the drift.
+        stamp_ns: Most likely moment.
         from_ns: Not before.
         to_ns: Not after.
-        gradual: It grew rather than jumped.
+        gradual: It grew rather than jumped; the moment is that of the first growth.
     """
 
     stamp_ns: int
     from_ns: int
     to_ns: int
-    gradual: bool
+    gradual: bool = False
 
 
 _FREE = 0.5
 """A score below it is nearer to the expected mount than to the one that is estimated now."""
 
 
-def change_point(
-    stamps_ns: NDArray[np.int64], scores: Floats, parameters: OnsetParameters
-) -> ChangePoint | None:
+def change_point(stamps_ns: NDArray[np.int64], scores: Floats, parameters: OnsetParameters) -> Onset | None:
     """The moment at which scores rise from about 0 to about 1; None where there are too few of them.
 
     Args:
@@ -101,7 +101,7 @@ def change_point(
     if int(lowest.min()) < 0 or (gradual and first == 0):
         stamp = int(stamps_ns[0])
     stamp = max(stamp, int(stamps_ns[first]))
-    return ChangePoint(stamp, int(stamps_ns[first]), max(stamp, int(stamps_ns[last])), gradual)
+    return Onset(stamp, int(stamps_ns[first]), max(stamp, int(stamps_ns[last])), gradual)
 
 
 def _neighbours(tried: NDArray[np.int64], chosen: NDArray[np.int64], side: int) -> NDArray[np.int64]:
@@ -141,7 +141,9 @@ class _Series:
                 if time > 0:
                     C = C + (1.0 - white) * np.exp(-apart / time)
                 # A clock may give two stamps alike: the noise of their scores is never quite the same.
-                self._roots.append(np.linalg.cholesky(C + _NUGGET * np.eye(len(t))))
+                self._roots.append(
+                    np.asarray(np.linalg.cholesky(C + _NUGGET * np.eye(len(t))), dtype=np.float64)
+                )
 
     def loss(self, shapes: Floats) -> Floats:
         """Twice the negative log likelihood, (M,), of shapes (M,N) that run from 0 to 1.
@@ -153,7 +155,7 @@ class _Series:
         degrees = max(n - _LEVELS, 1)
         for L in self._roots:
             columns = np.column_stack([self._y, np.ones(n), shapes.T])
-            white = np.linalg.solve(L, columns)
+            white = np.asarray(np.linalg.solve(L, columns), dtype=np.float64)
             rest = _unexplained(white[:, 0], white[:, 1], white[:, 2:])
             spread = 2.0 * float(np.log(np.diag(L)).sum())
             # Degrees of freedom that are left, so that few scores are not too sure.
@@ -163,7 +165,11 @@ class _Series:
 
 
 _LEVELS = 2
+"""Free levels: before and after."""
+
 _NUGGET = 1e-6
+"""Share of the variance that is white in any case."""
+
 _EXACT = 1e-6
 """Squared score: scores of one drive scatter by 0.05 at least, the square of a thousandth is none."""
 
@@ -189,3 +195,4 @@ def _unexplained(y: Floats, one: Floats, shapes: Floats) -> Floats:
 
 
 _TINY = 1e-12
+"""Sums of squares below it are none: whitened columns are of the order of one."""

@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pipeline.drift_test import Judgement
+from pipeline.onset import Onset
 from pipeline.records import AXES, Floats
 
 State: TypeAlias = Literal["starting", "healthy", "suspect", "drifted", "unobservable", "stale", "fault"]
@@ -45,18 +46,6 @@ class VerdictParameters:
     agreement_sigma: float = 2.0
     patience_ns: int = 10_000_000_000
     silence_ns: int = 2_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Onset:
-    """When a drift began: most likely stamp, and the interval that holds it, ns.
-
-    A most likely stamp at the beginning of the interval says that nothing before it was free of the drift.
-    """
-
-    stamp_ns: int
-    from_ns: int
-    to_ns: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,3 @@
-import dataclasses
 import math
 import typing
 
@@ -9,8 +8,9 @@ from hypothesis import strategies as st
 
 from pipeline import verdict
 from pipeline.drift_test import Judgement
+from pipeline.onset import Onset
 from pipeline.records import AXES
-from pipeline.verdict import CODES, Onset, State, VerdictParameters, acknowledge, advance, start
+from pipeline.verdict import CODES, State, VerdictParameters, acknowledge, advance, start
 
 S = 1_000_000_000
 P = VerdictParameters()
@@ -185,11 +185,11 @@ def test_what_is_blind_or_contradicted_makes_no_drift_worse():
 
 def test_onset_lies_between_the_last_quiet_window_and_the_first_stir():
     memory = walked(QUIET, QUIET, SUSPICIOUS, ALARM, ALARM, ALARM)
-    assert dataclasses.astuple(memory.onset) == (2 * S, -S, 3 * S)
+    assert memory.onset == Onset(2 * S, -S, 3 * S)
     # A window of which half is older than the drift is quiet still: the interval holds its frames.
     late = after(after(walked(QUIET), QUIET, 5 * S, window_ns=S), ALARM, 6 * S)
     late = after(after(late, ALARM, 7 * S), ALARM, 8 * S)
-    assert dataclasses.astuple(late.onset) == (5 * S, 4 * S, 6 * S)
+    assert late.onset == Onset(5 * S, 4 * S, 6 * S)
 
 
 def test_a_blind_stretch_before_the_first_alarm_is_inside_the_onset_interval():

@@ -1,21 +1,12 @@
 """Small steady drift over many scenes: a likelihood ratio over every stretch of road that ends now.
 
-A window tells a drift that exceeds its floor at once; a smaller one shows only over several streets. Evidence
-comes in scenes, stretches of road that share no frames. Of scene k the estimate of the mount is
-
-    d_k = m + s_k + f_k tau + e_k
-
-m the mount; s_k the systematic part, common to a street and another on the next (covariance: the floor;
-correlation falls over metres); f_k the drift that one sigma of error in time feigns, tau that error, one for
-the whole drive; e_k the random error. m and s_k can not be told apart in one street, so the floor is never
-divided by a number of scenes, only, slowly, by a number of streets (FORMULAS F2, F4).
-
-For each beginning of a stretch a Kalman filter of its own estimates m over the stretch, from nothing;
-another one estimates it over all that came before, from what is expected of an unmoved mount. The statistic
-is the squared difference of the two in sigmas, for the beginning where it is largest. The systematic parts
-before and after count as independent, as around a corner: where they agree, alarms are rarer still. What a
-scene does not see carries no information in that direction, which a vector sum of whitened innovations could
-not take into account (FORMULAS F3).
+A window tells a drift that exceeds its floor at once; a smaller one shows only over several streets. For each
+beginning of a stretch a filter of its own (``scene_filter``) estimates the mount over the stretch, from
+nothing; another one estimates it over all that came before, from what is expected of an unmoved mount. The
+statistic is the squared difference of the two in sigmas, for the beginning where it is largest. The
+systematic parts before and after count as independent, as around a corner: where they agree, alarms are rarer
+still. What a scene does not see carries no information in that direction, which a vector sum of whitened
+innovations could not take into account (FORMULAS F3).
 """
 
 import math
@@ -23,16 +14,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipeline import scene_filter
 from pipeline.drift_test import Expectation
 from pipeline.records import Floats, read_only
 from pipeline.run_length import AlarmBudget, alarm_level, suspicion_level
+from pipeline.scene_filter import Scene
 
 NEW_SCENE_M = 20.0
 """m driven from one scene to the next, at least: what is 20 m ahead, where pitch and up, yaw and left are
 told apart, is new. Standing still adds none."""
-
-_STATES = 13
-"""m (6), s (6), tau."""
 
 _FARTHEST = np.array([math.radians(10.0)] * 3 + [3.0] * 3)
 """rad, m; sigma of the mount of a stretch before its scenes are heard: nothing is known of it."""
@@ -59,25 +49,6 @@ class SceneSumParameters:
     correlation_m: float = 300.0
     most_square: float = 22.46
     budget: AlarmBudget = field(default_factory=AlarmBudget)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """What one stretch of road says of the mount, vehicle axes, rad and m.
-
-    Attributes:
-        drift: float64 (6,), estimate against the expected mean.
-        covariance: float64 (6,6), of its random error; large in directions that it does not see.
-        feigned: float64 (6,), drift that one sigma of error in time feigns.
-        way_m: Way driven since any origin, m.
-        stamp_ns: Of its newest frame.
-    """
-
-    drift: Floats
-    covariance: Floats
-    feigned: Floats
-    way_m: float
-    stamp_ns: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,8 +114,8 @@ def begin(expectation: Expectation) -> SceneSum:
     return SceneSum(
         scenes=0,
         way_m=None,
-        mean=np.zeros((1, _STATES)),
-        covariance=_prior(expectation.covariance, expectation.floor)[None],
+        mean=np.zeros((1, scene_filter.STATES)),
+        covariance=scene_filter.prior(expectation.covariance, expectation.floor)[None],
         before=np.zeros((1, 6)),
         before_covariance=np.zeros((1, 6, 6)),
         first=np.zeros(1, dtype=np.int64),
@@ -175,13 +146,16 @@ def advance(
         expectation: The same as at :func:`begin`: its floor is that of the systematic part.
         parameters: See there.
     """
-    mean, covariance = _driven(total, scene.way_m, expectation.floor, parameters.correlation_m)
+    way = 0.0 if total.way_m is None else max(scene.way_m - total.way_m, 0.0)
+    mean, covariance = scene_filter.driven(
+        total.mean, total.covariance, way, expectation.floor, parameters.correlation_m
+    )
     before, before_covariance = mean[0, :6], covariance[0, :6, :6]
-    noise = _heard(scene, before, before_covariance, expectation.floor, parameters.most_square)
-    fresh = _prior(np.diag(_FARTHEST**2), expectation.floor)
-    mean = np.concatenate([mean, np.zeros((1, _STATES))])
+    noise = scene_filter.heard(scene, before, before_covariance + expectation.floor, parameters.most_square)
+    fresh = scene_filter.prior(np.diag(_FARTHEST**2), expectation.floor)
+    mean = np.concatenate([mean, np.zeros((1, scene_filter.STATES))])
     covariance = np.concatenate([covariance, fresh[None]])
-    mean, covariance = _updated(mean, covariance, scene, noise)
+    mean, covariance = scene_filter.updated(mean, covariance, scene, noise)
     before = np.concatenate([total.before, before[None]])
     before_covariance = np.concatenate([total.before_covariance, before_covariance[None]])
     first = np.append(total.first, total.scenes)
@@ -215,44 +189,6 @@ def alarming(total: SceneSum, parameters: SceneSumParameters) -> bool:
 def suspicious(total: SceneSum, parameters: SceneSumParameters) -> bool:
     """Whether the sum wants more evidence."""
     return total.scenes > 0 and total.statistic > suspicion_level(total.scenes, parameters.budget)
-
-
-def _prior(mount: Floats, floor: Floats) -> Floats:
-    """Covariance (13,13) of a filter that has heard nothing."""
-    prior = np.zeros((_STATES, _STATES))
-    prior[:6, :6], prior[6:12, 6:12], prior[12, 12] = mount, floor, 1.0
-    return prior
-
-
-def _driven(total: SceneSum, way_m: float, floor: Floats, correlation_m: float) -> tuple[Floats, Floats]:
-    """Means and covariances brought to the next scene: the systematic part forgets itself on the way."""
-    way = 0.0 if total.way_m is None else max(way_m - total.way_m, 0.0)
-    kept = math.exp(-way / correlation_m)
-    scale = np.ones(_STATES)
-    scale[6:12] = kept
-    covariance = total.covariance * np.outer(scale, scale)
-    covariance[:, 6:12, 6:12] += (1.0 - kept**2) * floor
-    return total.mean * scale, covariance
-
-
-def _heard(scene: Scene, before: Floats, before_covariance: Floats, floor: Floats, most: float) -> Floats:
-    """Covariance (6,6) of the scene's random error, widened where it is too far off to be heard in full."""
-    expected = scene.covariance + np.outer(scene.feigned, scene.feigned) + floor + before_covariance
-    off = scene.drift - before
-    square = float(off @ np.linalg.solve(expected, off))
-    return np.asarray(scene.covariance + max(0.0, square / most - 1.0) * expected)
-
-
-def _updated(mean: Floats, covariance: Floats, scene: Scene, noise: Floats) -> tuple[Floats, Floats]:
-    """All filters after the scene: Kalman's update, n at once."""
-    H = np.hstack([np.eye(6), np.eye(6), scene.feigned[:, None]])
-    seen = covariance @ H.T
-    gain = np.swapaxes(np.linalg.solve(H @ seen + noise, np.swapaxes(seen, 1, 2)), 1, 2)
-    mean = mean + np.einsum("nij,nj->ni", gain, scene.drift - mean @ H.T)
-    # Joseph's form: a diffuse prior of metres beside errors of millimetres costs no digits.
-    rest = np.eye(_STATES) - gain @ H
-    covariance = rest @ covariance @ np.swapaxes(rest, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
-    return mean, 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
 def _kept(first: np.ndarray, newest: int) -> np.ndarray:

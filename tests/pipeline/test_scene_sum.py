@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from pipeline.drift_test import DriftTestParameters, Expectation, expectation_of_stored
 from pipeline.records import Floats
 from pipeline.run_length import AlarmBudget
+from pipeline.scene_filter import Scene
 from pipeline.scene_sum import (
     NEW_SCENE_M,
-    Scene,
     SceneSum,
     SceneSumParameters,
     advance,

@@ -16,7 +16,7 @@ class TrackParameters:
     """How fast a mount is followed.
 
     Attributes:
-        walk_rad: Standard deviation of a healthy mount's turn about each axis in an hour of driving, rad: what
+        walk_rad: Standard deviation of a healthy mount's turn about an axis in an hour of driving, rad: what
             sun and load do to a bracket. A faster one is followed late and told by the tests, a slower one
             only loses precision.
         walk_m: The same of its shift, m.

@@ -28,10 +28,10 @@ Cause: TypeAlias = Literal["mount", "time_offset", "intrinsics_changed", "forwar
 """What the evidence names, closed list.
 
 mount: the mount moved, whatever else did.
-time_offset: the clocks alone explain it, the mount alone does not.
-intrinsics_changed: the lens alone explains it, the mount alone does not.
-forward_or_sync: mount or clock, each alone explains it: more speeds are wanted.
-cause_open: any other set of causes explains it.
+time_offset: the clocks alone explain it, far better than the mount or the lens.
+intrinsics_changed: the lens alone explains it, far better than the mount or the clocks.
+forward_or_sync: mount or clocks, each alone explains it: more speeds are wanted.
+cause_open: any other set explains it, or no single one.
 """
 
 CLOCK, LENS = 6, 7
@@ -56,6 +56,8 @@ class CauseParameters:
         single_alone: The same for the clock or the lens alone: 7 degrees of freedom.
         zoom: Uncertainty of a sound focal length, as a share: 0.2 % is one px at the border of an image of
             1000 px, the blur of its gradients.
+        rival: Misfit by which one cause must explain better than another to be preferred: chi-square, 1 degree
+            of freedom, at 1e-3, which are odds of two hundred to one.
         separable_sigmas: The time offset is separable when one that feigns a drift of an alert limit would
             stand out by so many sigma.
     """
@@ -64,6 +66,7 @@ class CauseParameters:
     single: float = 15.14
     mount_alone: float = 18.42
     single_alone: float = 29.88
+    rival: float = 10.83
     zoom: float = 0.002
     separable_sigmas: float = 3.0
 
@@ -137,13 +140,17 @@ class Explanation:
         if self.needed[0] > parameters.mount:
             return "mount"
         most = (parameters.mount_alone, parameters.single_alone, parameters.single_alone)
-        fit = tuple(name for name, left, m in zip(SOURCES, self.alone, most, strict=True) if left <= m)
+        best = int(np.argmin(self.alone))
+        if self.alone[best] > most[best]:
+            return "cause_open"
+        rivals = self.alone <= self.alone[best] + parameters.rival
         named: dict[tuple[str, ...], Cause] = {
             ("mount",): "mount",
             ("clock",): "time_offset",
             ("lens",): "intrinsics_changed",
             ("mount", "clock"): "forward_or_sync",
         }
+        fit = tuple(name for name, rival in zip(SOURCES, rivals, strict=True) if rival)
         return named.get(fit, "cause_open")
 
     def changed(self, source: Literal["clock", "lens"], parameters: CauseParameters) -> bool:

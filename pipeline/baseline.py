@@ -6,6 +6,7 @@ and spread are those of the largest restricted posterior, the spread drawn towar
 any rig; what is handed to the test is narrower than that floor only where the stretches prove it.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +17,15 @@ from scipy import special
 from pipeline.drift_test import DriftTestParameters, Expectation
 from pipeline.errors import InputError
 from pipeline.records import Floats
-from pipeline.run_tail import Tail, tail_of
-from pipeline.stretches import (
+from pipeline.road_samples import (
+    RoadSample,
     Scatter,
-    Stretch,
     WindowEstimates,
+    sample_of,
     scatter_of,
     stretches_of,
-    summary_of,
 )
+from pipeline.run_tail import Tail, tail_of
 
 PRIOR_SCENES = 8.0
 """Scenes that the floor for any rig was drawn from, two drives and six single frames (PROBE 3): it weighs as
@@ -58,7 +59,7 @@ class Baseline:
     departure: Floats
     deviation: Floats
     scatter: Scatter
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[RoadSample, ...]
     tail: Tail
 
     @property
@@ -70,6 +71,12 @@ class Baseline:
         """What the test expects of the mount while it has not moved (FORMULAS F2, F5)."""
         floor = supported_floor(self.spread, parameters.floor(), len(self.stretches))
         return Expectation(self.bias, self.covariance, floor, self._bound(parameters.bound()))
+
+    def thresholds(self, parameters: DriftTestParameters) -> DriftTestParameters:
+        """The test with the alarm of the wanted run length, where the stretches suffice to tell it."""
+        if self.tail.threshold is None:
+            return parameters
+        return dataclasses.replace(parameters, alarm=max(self.tail.threshold, parameters.suspicion))
 
     def _bound(self, bound: Floats) -> Floats:
         """b_j (6,): narrowed to what the stretches are sure to keep, widened to what one did not keep."""
@@ -120,7 +127,7 @@ def learn(drives: Sequence[WindowEstimates], parameters: DriftTestParameters, wa
     if not parts:
         raise InputError("no window was judged in any recording", hint="longer healthy recordings")
     scatter = scatter_of(parts)
-    stretches = tuple(summary_of(part, scatter) for part in parts)
+    stretches = tuple(sample_of(part, scatter) for part in parts)
     bias, covariance, spread = _fitted(stretches, parameters.floor())
     means = np.array([stretch.mean for stretch in stretches])
     own = 2.0 * np.sqrt([np.diag(stretch.covariance) for stretch in stretches])
@@ -141,7 +148,7 @@ def learn(drives: Sequence[WindowEstimates], parameters: DriftTestParameters, wa
     )
 
 
-def _fitted(stretches: Sequence[Stretch], floor: Floats) -> tuple[Floats, Floats, Floats]:
+def _fitted(stretches: Sequence[RoadSample], floor: Floats) -> tuple[Floats, Floats, Floats]:
     """Bias (6,), its covariance (6,6), and spread (6,6) by restricted expectation and maximisation.
 
     The spread's prior is inverse Wishart about ``floor`` with the weight of ``PRIOR_SCENES`` stretches. With
@@ -190,7 +197,7 @@ class LeftOut:
     statistic: float
 
 
-def left_out(stretches: Sequence[Stretch], parameters: DriftTestParameters) -> tuple[LeftOut, ...]:
+def left_out(stretches: Sequence[RoadSample], parameters: DriftTestParameters) -> tuple[LeftOut, ...]:
     """Each recording against the baseline of all others; nothing where there is only one recording.
 
     However long it is, a recording counts as one scene: it has one load, weather, and traffic.
@@ -216,7 +223,7 @@ def left_out(stretches: Sequence[Stretch], parameters: DriftTestParameters) -> t
     return tuple(results)
 
 
-def _joined(stretches: Sequence[Stretch]) -> tuple[Floats, Floats]:
+def _joined(stretches: Sequence[RoadSample]) -> tuple[Floats, Floats]:
     """Mean of several stretches by information, and its random covariance."""
     information = np.linalg.inv([stretch.covariance for stretch in stretches])
     covariance = np.linalg.inv(information.sum(axis=0))
@@ -226,7 +233,7 @@ def _joined(stretches: Sequence[Stretch]) -> tuple[Floats, Floats]:
 
 def _largest_statistics(
     parts: Sequence[WindowEstimates],
-    stretches: Sequence[Stretch],
+    stretches: Sequence[RoadSample],
     scatter: Scatter,
     parameters: DriftTestParameters,
 ) -> Floats:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline import se3
+from pipeline.baseline import Baseline
 from pipeline.deskew import SpinSense
 from pipeline.drift_test import DriftTestParameters, Expectation, expectation_of_stored
 from pipeline.ego import Straightened
@@ -24,6 +25,7 @@ class Mount:
         limits: float64 (6,), alert limits.
         required: Axes that must be monitored for 'healthy'.
         spin: Sense of rotation of the LiDAR where it is configured.
+        baseline: What healthy drives taught about this mount under this extrinsic, or None.
     """
 
     camera: CameraModel
@@ -34,10 +36,22 @@ class Mount:
     limits: Floats
     required: tuple[str, ...]
     spin: SpinSense | None = None
+    baseline: Baseline | None = None
 
     def expectation(self, test: DriftTestParameters) -> Expectation:
         """What estimates of this mount are expected to be while it has not moved."""
+        if self.baseline is not None:
+            return self.baseline.expectation(test)
         return expectation_of_stored(self.sigma_rad, self.sigma_m, test)
+
+    def thresholds(self, test: DriftTestParameters) -> DriftTestParameters:
+        """The test with the thresholds that are this mount's own, where a baseline could learn them."""
+        return test if self.baseline is None else self.baseline.thresholds(test)
+
+    @property
+    def noise(self) -> float:
+        """Factor on the stated sigma of a window; few drives make no window surer than it says it is."""
+        return 1.0 if self.baseline is None else max(1.0, self.baseline.scatter.noise)
 
     @property
     def R_vehicle_cam(self) -> Floats:  # noqa: N802 - the name of the rotation

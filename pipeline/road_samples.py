@@ -1,0 +1,220 @@
+"""Estimates of windows along drives, cut into stretches of road that are each one sample of the scene.
+
+Windows of one street see the same things: they tell the random error (how it scatters, how far along the road
+it stays alike), and together ONE value of the error that the scene adds (PROBE 2, 11.5).
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.records import Floats, read_only
+
+STRETCH_M = 200.0
+"""m of road after which the scene counts as another: ten times what shows a new view (NEW_SCENE_M)."""
+
+_WINDOWS_A_STRETCH = 4.0
+"""A stretch is at least so many windows long: a window on its border belongs to neither side."""
+
+_APART_M = 1.0
+"""m; windows closer together than this are one: they hold the same frames but for one."""
+
+_SHORTEST_CORRELATION_M = 20.0
+"""m; edges lie 40 m ahead, so what is seen now is seen until half of that is driven (NEW_SCENE_M)."""
+
+_CORRELATIONS = 16
+"""Correlation lengths that are tried, from the shortest to ``STRETCH_M``, each 1.17 times the one before."""
+
+_PRIOR_DRIVES = 4.0
+"""Drives on which the stated sigma was measured (PROBE 4): as many samples as stand behind a noise of 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowEstimates:
+    """What the judgements along one drive estimated, in order of time; vehicle axes, rad and m.
+
+    Attributes:
+        recording: Name of the drive.
+        drift: float64 (N,6), estimates against the stored extrinsic.
+        covariance: float64 (N,6,6), stated covariance of their random error.
+        feigned: float64 (N,6), drift that one sigma of error in the time between sweep and image would feign.
+        way_m: float64 (N,2), way driven at the oldest and at the newest frame of each window, m.
+        stamp_ns: int64 (N,), stamp of the newest frame of each window.
+    """
+
+    recording: str
+    drift: Floats
+    covariance: Floats
+    feigned: Floats
+    way_m: Floats
+    stamp_ns: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("drift", "covariance", "feigned", "way_m", "stamp_ns"):
+            object.__setattr__(self, name, read_only(np.asarray(getattr(self, name))))
+
+    def __len__(self) -> int:
+        return len(self.drift)
+
+    def chosen(self, kept: np.ndarray) -> "WindowEstimates":
+        """The windows that an index array or a mask (N,) names."""
+        return dataclasses.replace(
+            self,
+            drift=self.drift[kept],
+            covariance=self.covariance[kept],
+            feigned=self.feigned[kept],
+            way_m=self.way_m[kept],
+            stamp_ns=self.stamp_ns[kept],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scatter:
+    """The random error of windows inside a stretch.
+
+    Attributes:
+        noise: Factor on the stated sigma: 1 where it is honest.
+        correlation_m: Way driven after which the error of a window is alike to 1/e, m.
+    """
+
+    noise: float
+    correlation_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadSample:
+    """One stretch of road: one sample of the scene.
+
+    Attributes:
+        recording: Name of the drive that it is part of.
+        mean: float64 (6,), mean estimate, weighted by information; rad and m.
+        covariance: float64 (6,6), of its random error.
+        windows: Windows, at least ``_APART_M`` apart.
+        samples: Independent windows that they are worth.
+        way_m: Way from the first frame to the last, m.
+        seconds: Time from the first window to the last, s.
+    """
+
+    recording: str
+    mean: Floats
+    covariance: Floats
+    windows: int
+    samples: float
+    way_m: float
+    seconds: float
+
+
+def stretches_of(drive: WindowEstimates) -> list[WindowEstimates]:
+    """Cuts a drive into equal stretches of at least 200 m and four windows; a shorter drive is one stretch.
+
+    Windows that reach over a border are left out: the stretches share no frame. Windows within ``_APART_M``
+    count once, the later one, which saw more.
+    """
+    if len(drive) == 0:
+        return []
+    begin, end = drive.way_m[:, 0], drive.way_m[:, 1]
+    start = float(begin.min())
+    way = float(end.max()) - start
+    whole = math.floor(way / max(STRETCH_M, _WINDOWS_A_STRETCH * float(np.median(end - begin))))
+    if whole <= 1:
+        return [_apart(drive)]
+    length = way / whole
+    parts = []
+    for index in range(whole):
+        inside = (begin >= start + index * length) & (end <= start + (index + 1) * length)
+        if inside.any():
+            parts.append(_apart(drive.chosen(inside)))
+    return parts
+
+
+def _apart(drive: WindowEstimates) -> WindowEstimates:
+    kept: list[int] = []
+    for index in range(len(drive) - 1, -1, -1):
+        if not kept or drive.way_m[kept[-1], 1] - drive.way_m[index, 1] >= _APART_M:
+            kept.append(index)
+    return drive.chosen(np.array(kept[::-1]))
+
+
+def scatter_of(stretches: Sequence[WindowEstimates]) -> Scatter:
+    """Noise and correlation of windows inside stretches, each stretch with a mean of its own.
+
+    Errors are taken as ``noise^2`` times the stated covariance, alike as ``exp(-way / correlation_m)`` (AR(1)
+    over the way driven, FORMULAS F1). The length is that of the largest restricted likelihood; it is at least
+    half a window, for windows that share frames are alike. The noise is drawn to 1 by the drives on which the
+    stated sigma was measured: two windows more do not prove it wrong.
+    """
+    spans = [np.median(part.way_m[:, 1] - part.way_m[:, 0]) for part in stretches]
+    shortest = max(_SHORTEST_CORRELATION_M, 0.5 * float(np.median(spans)))
+    degrees = 6 * sum(len(part) - 1 for part in stretches)
+    if degrees == 0:
+        return Scatter(noise=1.0, correlation_m=shortest)
+    best, length, variance = -math.inf, shortest, 1.0
+    for tried in np.geomspace(shortest, max(STRETCH_M, shortest), _CORRELATIONS):
+        fits = [_restricted(part, float(tried)) for part in stretches if len(part) > 1]
+        squares = sum(fit[0] for fit in fits)
+        # Estimates that repeat each other to the last digit must not make the logarithm infinite.
+        likelihood = -0.5 * (sum(fit[1] for fit in fits) + degrees * math.log(squares / degrees + 1e-300))
+        if likelihood > best:
+            best, length, variance = likelihood, float(tried), squares / degrees
+    samples = sum(effective_samples(part.way_m[:, 1], length) - 1.0 for part in stretches)
+    noise = math.sqrt((_PRIOR_DRIVES + samples * variance) / (_PRIOR_DRIVES + samples))
+    return Scatter(noise=noise, correlation_m=length)
+
+
+def _restricted(part: WindowEstimates, length_m: float) -> tuple[float, float]:
+    """Squared residuals, whitened, and the log determinants of the restricted likelihood."""
+    roots = _inverse_roots(part.covariance)
+    factor = np.linalg.cholesky(_alike(part.way_m[:, 1], length_m))
+    values = np.einsum("nij,nj->ni", roots, part.drift)
+    values = np.linalg.solve(factor, values).ravel()
+    design = np.linalg.solve(factor, roots.reshape(len(part), 36)).reshape(-1, 6)
+    # Scaled, for radians and metres differ by orders of magnitude.
+    scale = np.linalg.norm(design, axis=0)
+    q, r = np.linalg.qr(design / scale)
+    residual = values - q @ (q.T @ values)
+    log_determinant = 12.0 * float(np.log(np.diag(factor)).sum())
+    log_determinant += 2.0 * float(np.log(np.abs(np.diag(r)) * scale).sum())
+    return float(residual @ residual), log_determinant
+
+
+def _alike(way_m: Floats, length_m: float) -> Floats:
+    """Correlation (N,N) of windows by the way between them."""
+    return np.asarray(np.exp(-np.abs(way_m[:, None] - way_m[None, :]) / length_m), dtype=np.float64)
+
+
+def _inverse_roots(covariance: Floats) -> Floats:
+    """Symmetric ``C^-1/2``, (N,6,6)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1), dtype=np.float64)
+
+
+def effective_samples(way_m: Floats, length_m: float) -> float:
+    """Independent windows that windows at ``way_m`` (N,) are worth: ``N^2 / sum of correlations``."""
+    return len(way_m) ** 2 / float(_alike(way_m, length_m).sum())
+
+
+def sample_of(part: WindowEstimates, scatter: Scatter) -> RoadSample:
+    """Mean of a stretch, its random error, and what it is worth.
+
+    An error in the time between sweep and image is the same all along: it is not divided by anything.
+    """
+    roots = _inverse_roots(part.covariance)
+    information = roots @ roots
+    total = np.linalg.inv(information.sum(axis=0))
+    mean = total @ np.einsum("nij,nj->i", information, part.drift)
+    feigned = total @ np.einsum("nij,nj->i", information, part.feigned)
+    alike = _alike(part.way_m[:, 1], scatter.correlation_m)
+    pull = np.einsum("nij,nm,mjk->ik", roots, alike, roots, optimize=True)
+    covariance = scatter.noise**2 * total @ pull @ total + np.outer(feigned, feigned)
+    return RoadSample(
+        recording=part.recording,
+        mean=np.asarray(mean, dtype=np.float64),
+        covariance=0.5 * (covariance + covariance.T),
+        windows=len(part),
+        samples=effective_samples(part.way_m[:, 1], scatter.correlation_m),
+        way_m=float(part.way_m[:, 1].max() - part.way_m[:, 0].min()),
+        seconds=float(part.stamp_ns[-1] - part.stamp_ns[0]) / 1e9,
+    )

@@ -6,6 +6,7 @@ length.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -120,13 +121,17 @@ def _responses(grey: NDArray[np.float32], unit: float) -> list[NDArray[np.float3
 
 
 def sample(
-    stack: NDArray[np.uint16], slot: NDArray[np.int64], uv: Floats, angle: Floats, scale: tuple[float, float]
+    images: Sequence[NDArray[np.uint16]],
+    slot: NDArray[np.int64],
+    uv: Floats,
+    angle: Floats,
+    scale: tuple[float, float],
 ) -> tuple[Floats, Floats]:
     """Response and its gradient at image pixels, bilinear in place and linear in orientation.
 
     Args:
-        stack: uint16 (F,4,h,w), the same level of F images.
-        slot: int64 (N,), image of each sample.
+        images: uint16 (4,h,w) each, the same level of F images of one size; where they lie, they are read.
+        slot: int64 (N,), image of each sample, ascending.
         uv: float64 (N,2), image px.
         angle: float64 (N,), direction of the step in the image, rad (taken modulo pi).
         scale: (sx, sy) of the level.
@@ -135,7 +140,7 @@ def sample(
         Response (N,), and its derivative by image px (N,2), with the orientation held; outside the image the
         border's value and derivative 0.
     """
-    h, w = stack.shape[2:]
+    h, w = images[0].shape[1:]
     x = (uv[:, 0] + 0.5) * scale[0] - 0.5
     y = (uv[:, 1] + 0.5) * scale[1] - 0.5
     x_in, y_in = np.clip(x, 0.0, w - 1.001), np.clip(y, 0.0, h - 1.001)
@@ -145,12 +150,18 @@ def sample(
     below = np.floor(turn)
     fo = turn - below
     o0 = below.astype(np.int64) & (ORIENTATIONS - 1)
-    first = ((slot * ORIENTATIONS + o0) * h + y0) * w + x0
-    second = first + np.where(o0 == ORIENTATIONS - 1, (1 - ORIENTATIONS) * h * w, h * w)
-    flat = stack.reshape(-1)
-    taps = np.empty((4, len(x)))
-    for tap, offset in enumerate((0, 1, w, w + 1)):
-        taps[tap] = (1.0 - fo) * flat.take(first + offset) + fo * flat.take(second + offset)
+    # The four neighbours in place, of the orientation below and of the one above.
+    index = np.empty((8, len(x)), dtype=np.int64)
+    index[0] = (o0 * h + y0) * w + x0
+    index[4] = index[0] + np.where(o0 == ORIENTATIONS - 1, (1 - ORIENTATIONS) * h * w, h * w)
+    for tap, offset in enumerate((1, w, w + 1), 1):
+        np.add(index[0], offset, out=index[tap])
+        np.add(index[4], offset, out=index[4 + tap])
+    read = np.empty((8, len(x)))
+    bounds = np.searchsorted(slot, np.arange(len(images) + 1)).tolist()
+    for image, begin, end in zip(images, bounds[:-1], bounds[1:], strict=True):
+        read[:, begin:end] = image.reshape(-1).take(index[:, begin:end])
+    taps = read[:4] + fo * (read[4:] - read[:4])
     taps /= COUNTS
     top = taps[0] + fx * (taps[1] - taps[0])
     bottom = taps[2] + fx * (taps[3] - taps[2])

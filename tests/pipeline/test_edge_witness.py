@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from pipeline import cameras, edge_witness, se3
 from pipeline.edge_witness import UNITS, EdgeFrame, EdgeWitnessParameters, batch_of, score, score_only, solve
 from pipeline.edges import CELLS, EdgeParameters, Edges, find_edges
-from pipeline.gradients import COUNTS, LEVELS, ORIENTATIONS, GradientPyramid, gradient_pyramid
+from pipeline.gradients import COUNTS, LEVELS, ORIENTATIONS, GradientPyramid, gradient_pyramid, sample
 from pipeline.ground import fit_ground
 from pipeline.records import CameraImage, CameraModel, PointCloud
 
@@ -127,7 +127,8 @@ def test_the_same_seed_gives_the_same_answer(window):
     batch = batch_of(frames[:1], camera, P.most_edges)
     a, b = (solve(batch, T, FLOOR, P, np.random.default_rng(7)) for _ in range(2))
     for field in dataclasses.fields(a):
-        np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
+        if field.name != "trail":
+            np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
 
 
 @pytest.mark.parametrize("degrees", [90, -135])
@@ -217,7 +218,7 @@ def test_gradient_of_the_score_is_that_of_its_differences(seed, level):
 
     def held(xi):
         uv, _ = cameras.project_unbounded(SMALL, se3.apply(se3.retract(T, xi), batch.position))
-        value, _ = edge_witness.sample(batch.stacks[level], batch.slot, uv, angle, batch.scales[level])
+        value, _ = sample(batch.images[level], batch.slot, uv, angle, batch.scales[level])
         return float(batch.weight @ value) / float(batch.weight.sum())
 
     assert held(np.zeros(6)) == pytest.approx(total)
@@ -286,7 +287,7 @@ def test_a_batch_joins_frames_and_thins_them_evenly(window):
     assert np.bincount(few.slot).min() > 50
     thin = batch.thinned(3)
     np.testing.assert_array_equal(thin.position, batch.position[::3])
-    assert len(thin.stacks) == LEVELS
+    assert len(thin.images) == LEVELS
 
 
 def test_a_new_scene_begins_when_enough_way_is_driven(window):

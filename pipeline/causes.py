@@ -56,8 +56,8 @@ class CauseParameters:
         single_alone: The same for the clock or the lens alone: 7 degrees of freedom.
         zoom: Uncertainty of a sound focal length, as a share: 0.2 % is one px at the border of an image of
             1000 px, the blur of its gradients.
-        rival: Misfit by which one cause must explain better than another to be preferred: chi-square, 1 degree
-            of freedom, at 1e-3, which are odds of two hundred to one.
+        rival: Misfit by which one cause must explain better than another to be preferred: chi-square, one
+            degree of freedom, at 1e-3, odds of two hundred to one.
         separable_sigmas: The time offset is separable when one that feigns a drift of an alert limit would
             stand out by so many sigma.
     """

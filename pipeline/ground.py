@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from pipeline.records import Floats, PointCloud, read_only
@@ -86,6 +84,16 @@ class Relief:
         for name in self.__slots__:
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
+    def near_further(self, xyz: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Points (N,3) that lie about a plane other than the main one, in whatever part they are."""
+        near = np.zeros(len(xyz), dtype=bool)
+        for plane in self.planes[1:].astype(np.float32):
+            height = xyz @ plane[:3]
+            height += plane[3]
+            # Half the band and as much again for the rounding of single precision.
+            near |= np.abs(height, out=height) <= BAND_M
+        return near
+
     def heights(self, xyz: np.ndarray) -> Floats:
         """Heights above the plane of each one's place, float64 (N,), metres, of points (N,3)."""
         first, second = self.basis.astype(xyz.dtype)
@@ -147,13 +155,15 @@ def fit_ground(cloud: PointCloud, up: Floats, rng: np.random.Generator) -> Groun
     """
     xyz = cloud.xyz
     if len(xyz) > SUBSAMPLE:
-        xyz = xyz[rng.integers(0, len(xyz), SUBSAMPLE)]
+        xyz = xyz.take(rng.integers(0, len(xyz), SUBSAMPLE), axis=0)
     points = xyz.astype(np.float64)
     plan = points @ plane_basis(up).T
-    near = np.hypot(plan[:, 0], plan[:, 1]) < RANGE_M
-    points, plan = points[near], plan[near]
+    near = np.flatnonzero(np.hypot(plan[:, 0], plan[:, 1]) < RANGE_M)
+    points, plan = points.take(near, axis=0), plan.take(near, axis=0)
     cell = _cells(plan)
-    lowest = points[_lowest_of_cells(cell, points @ up)]
+    height = points @ up
+    first = _lowest_of_cells(cell, height)
+    lowest = points[first]
     if len(lowest) < MIN_CELLS:
         return None
     plane = _best_plane(lowest, up, rng)
@@ -164,23 +174,25 @@ def fit_ground(cloud: PointCloud, up: Floats, rng: np.random.Generator) -> Groun
         if len(means) < max(MIN_CELLS, MIN_SHARE * len(lowest)):
             return None
         plane = _least_squares(means, up)
-    bare = _bare(points @ up, cell)[_lowest_of_cells(cell, points @ up)]
-    planes = _further_planes(points, cell, lowest[bare], plane, up, rng)
-    relief = _relief(planes, lowest[bare], plane_basis(up))
+    bare = lowest[_bare(height, cell)[cell[first]]]
+    planes = _further_planes(points, cell, bare, plane, up, rng)
+    relief = _relief(planes, bare, plane_basis(up))
     normal, offset = plane[:3], float(plane[3])
     inliers = np.abs(cloud.xyz @ normal.astype(np.float32) + np.float32(offset)) <= BAND_M / 2
     if relief is not None:
-        inliers |= np.abs(relief.heights(cloud.xyz)) <= BAND_M / 2
+        # In the part of the main plane nothing is new, and few others lie about the plane of any part.
+        asked = np.flatnonzero(relief.near_further(cloud.xyz) & ~inliers)
+        inliers[asked] = np.abs(relief.heights(cloud.xyz.take(asked, axis=0))) <= BAND_M / 2
     return Ground(read_only(normal), offset, read_only(inliers), relief)
 
 
 def _bare(height: Floats, cell: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each point (N,) lies in a cell most of whose points are as low as its lowest one."""
+    """Whether most points of each cell are as low as its lowest one, of points (N,)."""
     lowest = np.full(int(cell.max(initial=0)) + 1, np.inf)
     np.minimum.at(lowest, cell, height)
     low = np.bincount(cell[height <= lowest[cell] + BAND_M], minlength=len(lowest))
     share = low / np.maximum(np.bincount(cell, minlength=len(lowest)), 1)
-    return np.asarray((share >= BARE_SHARE)[cell])
+    return np.asarray(share >= BARE_SHARE)
 
 
 def _further_planes(
@@ -203,8 +215,8 @@ def _further_planes(
         found = _further_plane(rest, known, up, rng)
         if found is None:
             break
-        free = (np.abs(points @ planes[:, :3].T + planes[:, 3]) > BAND_M / 2).all(axis=1)
-        refined = _refined(points[free], cell[free], found, up)
+        free = np.flatnonzero((np.abs(points @ planes[:, :3].T + planes[:, 3]) > BAND_M / 2).all(axis=1))
+        refined = _refined(points.take(free, axis=0), cell[free], found, up)
         if refined is None:
             break
         on = np.flatnonzero(np.abs(rest @ refined[:3] + refined[3]) <= BAND_M / 2)
@@ -235,8 +247,9 @@ class _Known:
 def _further_plane(rest: Floats, known: _Known, up: Floats, rng: np.random.Generator) -> Floats | None:
     """The plane (4,) with most cells (M,3) side by side that goes on from the ground."""
     planes, support = _hypotheses(rest, up, rng)
-    order = np.argsort(support.sum(axis=0), kind="stable")[::-1][:_FURTHER_TRIES]
-    if len(order) == 0 or int(support[:, order[0]].sum()) < MIN_FURTHER_CELLS:
+    count = _counts(support)
+    order = np.argsort(count, kind="stable")[::-1][:_FURTHER_TRIES]
+    if len(order) == 0 or count[order[0]] < MIN_FURTHER_CELLS:
         return None
     beside = (cdist(rest, rest) <= NEIGHBOUR_M).astype(np.float32)
     crowd = beside.sum(axis=1)
@@ -255,10 +268,20 @@ def _further_plane(rest: Floats, known: _Known, up: Floats, rng: np.random.Gener
 def _largest(chosen: NDArray[np.bool_], beside: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Of the chosen cells (M,) those of the largest group side by side (M,M): a crest falls off both ways."""
     index = np.flatnonzero(chosen)
-    label = connected_components(csr_array(beside[np.ix_(index, index)]), directed=False)[1]
+    linked = beside[np.ix_(index, index)]
+    left, best = np.ones(len(index), dtype=bool), index[:0]
+    while int(left.sum()) > len(best):
+        reached = np.zeros(len(index), dtype=np.float32)
+        reached[int(np.argmax(left))] = 1.0
+        size = 0
+        while size < (size := int(np.count_nonzero(reached))):
+            reached = (linked @ reached > 0.0).astype(np.float32)
+        group = np.flatnonzero(reached)
+        left[group] = False
+        if len(group) > len(best):
+            best = group
     largest = np.zeros_like(chosen)
-    if len(index):
-        largest[index[label == np.bincount(label).argmax()]] = True
+    largest[index[best]] = True
     return largest
 
 
@@ -318,9 +341,10 @@ def _lowest_of_cells(cell: NDArray[np.int64], height: Floats) -> NDArray[np.int6
 
 def _cell_means(points: Floats, cell: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
     """Mean (M,3) of the chosen points of each cell that has any."""
-    where = cell[chosen]
+    index = np.flatnonzero(chosen)
+    where, taken = cell.take(index), points.take(index, axis=0)
     count = np.bincount(where)
-    sums = np.stack([np.bincount(where, weights=points[chosen, axis]) for axis in range(3)], axis=1)
+    sums = np.stack([np.bincount(where, weights=column) for column in taken.T], axis=1)
     return np.asarray(sums[count > 0] / count[count > 0, None])
 
 
@@ -329,7 +353,12 @@ def _best_plane(points: Floats, up: Floats, rng: np.random.Generator) -> Floats 
     planes, support = _hypotheses(points, up, rng)
     if len(planes) == 0:
         return None
-    return np.asarray(planes[int(np.argmax(support.sum(axis=0)))])
+    return np.asarray(planes[int(np.argmax(_counts(support)))])
+
+
+def _counts(support: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Number of points (H,) in the band of each plane, of a table (M,H): a product is quicker than a sum."""
+    return np.ones(len(support), dtype=np.float32) @ support.astype(np.float32)
 
 
 def _hypotheses(points: Floats, up: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
@@ -343,7 +372,9 @@ def _hypotheses(points: Floats, up: Floats, rng: np.random.Generator) -> tuple[F
     level &= length > CELL_M * CELL_M / 4
     normal = normal[level] * (np.sign(along_up[level]) / length[level])[:, None]
     offset = -np.einsum("ij,ij->i", normal, triple[level, 0])
-    return np.column_stack([normal, offset]), np.abs(points @ normal.T + offset) <= BAND_M / 2
+    height = points @ normal.T
+    height += offset
+    return np.column_stack([normal, offset]), np.abs(height, out=height) <= BAND_M / 2
 
 
 def _least_squares(points: Floats, up: Floats) -> Floats:

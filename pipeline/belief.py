@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline import drift_test, edge_witness, fusion, line_witness, se3
 from pipeline.drift_test import Evidence, Judgement
-from pipeline.edge_witness import EdgeFrame, EdgeSolution
+from pipeline.edge_witness import EdgeFrame, EdgeSolution, Trail
 from pipeline.fusion import Testimony
 from pipeline.line_witness import LineFrame, LineSolution
 from pipeline.mount import Mount
@@ -51,6 +51,7 @@ def believe(
     parameters: Parameters,
     edge_frames: Sequence[EdgeFrame],
     line_frames: Sequence[LineFrame],
+    trail: Trail | None = None,
 ) -> Belief | None:
     """Solves the window, fuses the witnesses, tests the extrinsic that is expected to hold.
 
@@ -59,6 +60,7 @@ def believe(
         parameters: Settings.
         edge_frames: The window's frames with edges, ascending in time.
         line_frames: The window's frames with lines, likewise.
+        trail: What the edge witness left of the window before, or None.
 
     Returns:
         What is believed of the mount, or None where neither witness says anything.
@@ -70,7 +72,7 @@ def believe(
     T_expected = se3.retract(mount.T_cam_lidar, B.T @ expectation.mean)
     feigned = np.mean([f.feigned for f in edge_frames] or [np.zeros(6)], axis=0)
     doubt = expectation.floor + np.outer(feigned, feigned) + expectation.covariance
-    edges = _solve_edges(mount, parameters, edge_frames, T_expected, B.T @ doubt @ B)
+    edges = _solve_edges(mount, parameters, edge_frames, (T_expected, B.T @ doubt @ B), trail)
     matched = _solve_lines(mount, line_frames, T_expected)
     lines = matched if matched is not None and _testifies(matched) else None
     edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
@@ -110,14 +112,18 @@ def believe(
 
 
 def _solve_edges(
-    mount: Mount, parameters: Parameters, frames: Sequence[EdgeFrame], T_expected: Floats, doubt: Floats
+    mount: Mount,
+    parameters: Parameters,
+    frames: Sequence[EdgeFrame],
+    expected: tuple[Floats, Floats],
+    trail: Trail | None,
 ) -> EdgeSolution | None:
     if not frames:
         return None
-    settings = parameters.edge_witness
+    settings, (T_expected, doubt) = parameters.edge_witness, expected
     batch = edge_witness.batch_of(frames, mount.camera, settings.most_edges)
     rng = np.random.default_rng(parameters.seed)
-    return edge_witness.solve(batch, T_expected, doubt, settings, rng)
+    return edge_witness.solve(batch, T_expected, doubt, settings, rng, trail)
 
 
 def _solve_lines(mount: Mount, frames: Sequence[LineFrame], T_expected: Floats) -> LineSolution | None:

@@ -73,12 +73,14 @@ class Trail:
     """What the solution of one window leaves to the next.
 
     Attributes:
+        T_stored: float64 (4,4), the extrinsic that everything here is against.
         maxima: Those that are followed.
         inside: float64 (6,), the best xi inside the floor.
         shares: What each frame adds, by its stamp.
         places: float64 (4,4) each, the extrinsics of chance.
     """
 
+    T_stored: Floats
     maxima: Maxima
     inside: Floats
     shares: Mapping[int, FrameShare]
@@ -135,8 +137,10 @@ def solve(
             own uncertainty, camera axes.
         parameters: See there.
         rng: Draws the extrinsics of chance, where there is no trail.
-        trail: Of the window before, against the same stored extrinsic.
+        trail: Of the window before; one against another extrinsic says nothing.
     """
+    if trail is not None and not np.array_equal(trail.T_stored, T_stored):
+        trail = None
     places = tuple(far_extrinsics(T_stored, parameters, rng)) if trail is None else trail.places
     known = None if trail is None else _curvature(batch, trail.shares)
     stored = score(batch, T_stored, 0)
@@ -164,7 +168,7 @@ def solve(
         block_gains=_block_gains(batch.slot, at_best, at_inside),
         edges=len(batch),
         frames=len(batch.stamps_ns),
-        trail=Trail(maxima, inside, shares, places),
+        trail=Trail(T_stored, maxima, inside, shares, places),
     )
 
 

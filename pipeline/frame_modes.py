@@ -237,7 +237,7 @@ def _promising(
     widest = parameters.reach * math.hypot(prior.sigma_rad, prior.sigma_m / parameters.usual_m)
     places = np.zeros((parameters.draws, 6))
     places[:, :3] = (2.0 * drawn - 1.0) * widest
-    level = len(thin.stacks) - 1
+    level = len(thin.images) - 1
     heights = [edge_witness.score_only(thin, se3.retract(T_guess, xi), level).sum() for xi in places]
     return _apart(places, heights, parameters.climbed, parameters.spread, [])
 

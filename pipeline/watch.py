@@ -285,4 +285,8 @@ class Watch:
         # Lines of before the window would testify to another mount.
         since = self._edge_frames[0].stamp_ns if self._edge_frames else 0
         lines = [frame for stamp, frame in self._line_frames if stamp >= since]
-        return believe(self.mount, self.parameters, tuple(self._edge_frames), lines)
+        # What was followed before the window was forgotten is another mount's.
+        edges = None if self.belief is None or self._judged_ns is None else self.belief.edges
+        trail = None if edges is None else edges.trail
+        frames = tuple(self._edge_frames)
+        return believe(self.mount, self.parameters, frames, lines, trail=trail)

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline import se3
 from pipeline.baseline import Baseline
-from pipeline.deskew import SpinSense
+from pipeline.deskew import SpinSense, Twist
 from pipeline.drift_test import DriftTestParameters, Expectation, expectation_of_stored
 from pipeline.ego import Straightened
 from pipeline.records import CameraModel, Floats
@@ -68,15 +68,18 @@ class Mount:
         """Unit vector ahead (of the vehicle, else of the camera), LiDAR frame."""
         return np.asarray(self.R_vehicle_cam[0] @ self.T_cam_lidar[:3, :3], dtype=np.float64)
 
+    def motion(self, twist: Twist | None) -> Floats:
+        """Drift (6,), vehicle axes, that a camera feigns per second that it exposes late (FORMULAS G1)."""
+        if twist is None:
+            return np.array([0.0, 0.0, 0.0, _ASSUMED_M_S, 0.0, 0.0])
+        R_vehicle_lidar = self.R_vehicle_cam @ self.T_cam_lidar[:3, :3]
+        centre = -self.T_cam_lidar[:3, :3].T @ self.T_cam_lidar[:3, 3]
+        velocity = twist.velocity + np.cross(twist.omega, centre)
+        return np.concatenate([R_vehicle_lidar @ twist.omega, R_vehicle_lidar @ velocity])
+
     def feigned(self, sweep: Straightened) -> Floats:
         """Drift (6,), vehicle axes, that one sigma of error in a sweep's time would feign (FORMULAS G1)."""
-        R_vehicle_lidar = self.R_vehicle_cam @ self.T_cam_lidar[:3, :3]
-        if sweep.twist is None:
-            return np.array([0.0, 0.0, 0.0, sweep.sync_s * _ASSUMED_M_S, 0.0, 0.0])
-        centre = -self.T_cam_lidar[:3, :3].T @ self.T_cam_lidar[:3, 3]
-        velocity = sweep.twist.velocity + np.cross(sweep.twist.omega, centre)
-        motion = np.concatenate([R_vehicle_lidar @ sweep.twist.omega, R_vehicle_lidar @ velocity])
-        return np.asarray(sweep.sync_s * motion, dtype=np.float64)
+        return np.asarray(sweep.sync_s * self.motion(sweep.twist), dtype=np.float64)
 
 
 _ASSUMED_M_S = 10.0

@@ -110,6 +110,7 @@ class Explanation:
     Attributes:
         time_offset_s: The camera exposes so much later than its stamp says; mount free.
         time_sigma_s: Its standard deviation; wide where mount and clock can not be told apart.
+        time_alone_s: The time offset that would come nearest to explain all by itself.
         separable: Whether a time offset that matters would be told from a moved mount.
         zoom: Logarithm of the true focal length over the stored one; mount free.
         zoom_sigma: Its standard deviation.
@@ -122,6 +123,7 @@ class Explanation:
 
     time_offset_s: float
     time_sigma_s: float
+    time_alone_s: float
     separable: bool
     zoom: float
     zoom_sigma: float
@@ -182,6 +184,7 @@ def explain(
     return Explanation(
         time_offset_s=float(by_clock[CLOCK]),
         time_sigma_s=offset_sigma,
+        time_alone_s=float(regression.solved(frozenset({"clock"}))[0][CLOCK]),
         separable=tracked and bool(np.all(feigned <= limits)),
         zoom=float(by_lens[LENS]),
         zoom_sigma=math.sqrt(float(lens_covariance[LENS, LENS])),

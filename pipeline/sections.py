@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import edge_witness, se3, trust_region
+from pipeline import edge_score, se3, trust_region
 from pipeline.causes import CLOCK, LENS, UNKNOWNS, Section
-from pipeline.edge_witness import NEW_SCENE_M, UNITS, EdgeBatch, EdgeFrame, EdgeWitnessParameters
+from pipeline.edge_score import NEW_SCENE_M, UNITS, EdgeBatch, EdgeFrame
+from pipeline.edge_witness import EdgeWitnessParameters
 from pipeline.records import CameraModel, Floats
 
 _ZOOM_UNIT = 0.005
@@ -49,44 +50,54 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Passage:
-    """A frame and how the vehicle moved while it was taken.
+class Move:
+    """How the vehicle moved while a frame was taken.
 
     Attributes:
-        frame: What the edge witness keeps of it.
+        stamp_ns: Of the frame.
         motion: float64 (6,), drift that a second of delay would feign, vehicle axes (FORMULAS G1).
         tracked: Whether the motion was measured; else it is assumed.
         sync_s: How well the time between points and exposure is known, one sigma, s.
     """
 
-    frame: EdgeFrame
+    stamp_ns: int
     motion: Floats
     tracked: bool
     sync_s: float
 
 
-def fresh(passages: Sequence[Passage], last: Section | None, least_frames: int) -> tuple[Passage, ...]:
-    """The frames after ``last`` once they make a section of their own: new road, or another speed.
+@dataclass(frozen=True, slots=True, eq=False)
+class Passage:
+    """What the edge witness keeps of a frame, and the vehicle's move."""
+
+    frame: EdgeFrame
+    move: Move
+
+
+def fresh(passages: Sequence[Passage], last: Section | None, few: int, many: int) -> tuple[Passage, ...]:
+    """The frames after ``last`` once they make a section of their own.
 
     Args:
         passages: The window's frames, ascending in time.
         last: The newest section, or None.
-        least_frames: Frames that a section needs.
+        few: Frames that make one on new road.
+        many: Frames that make one on the same road, at another speed.
 
     Returns:
         The frames, or none while they are no section yet.
     """
-    new = tuple(p for p in passages if p.tracked and (last is None or p.frame.stamp_ns > last.to_ns))
-    if len(new) < least_frames:
+    new = tuple(p for p in passages if p.move.tracked and (last is None or p.move.stamp_ns > last.to_ns))
+    if len(new) < few:
         return ()
-    if last is None or new[-1].frame.distance_m - new[0].frame.distance_m >= NEW_SCENE_M:
+    if new[-1].frame.distance_m - new[0].frame.distance_m >= NEW_SCENE_M:
         return new
-    return new if abs(_speed(new) - last.speed) > _OTHER_SPEED_M_S else ()
+    other = last is None or abs(_speed(new) - last.speed) > _OTHER_SPEED_M_S
+    return new if len(new) >= many and other else ()
 
 
 def _speed(passages: Sequence[Passage]) -> float:
     """Mean speed, m/s."""
-    return float(np.mean([np.linalg.norm(p.motion[3:]) for p in passages]))
+    return float(np.mean([np.linalg.norm(p.move.motion[3:]) for p in passages]))
 
 
 def linearised(
@@ -100,7 +111,7 @@ def linearised(
         place: See there.
         parameters: Of the edge witness.
     """
-    batch = edge_witness.batch_of([p.frame for p in passages], place.camera, parameters.most_edges)
+    batch = edge_score.batch_of([p.frame for p in passages], place.camera, parameters.most_edges)
     zoomed = _Zoomed(batch, place.T_expected)
     x = np.array([*xi, 0.0]) / _CLIMB_UNITS
     H = _curvature(zoomed, x, parameters)
@@ -134,7 +145,7 @@ class _Zoomed:
         theta = x * _CLIMB_UNITS
         T = se3.retract(self._T, theta[:6])
         spread = np.array([np.exp(theta[6]), np.exp(theta[6]), 1.0])
-        value, _, share = edge_witness.score(self._batch, np.diag([*spread, 1.0]) @ T, 0)
+        value, _, share = edge_score.score(self._batch, np.diag([*spread, 1.0]) @ T, 0)
         points = self._batch.position @ T[:3, :3].T + T[:3, 3]
         by_point = share[:, 3:] * spread
         by_zoom = (by_point[:, :2] * points[:, :2]).sum(axis=1)
@@ -172,7 +183,7 @@ def _joined(
     what their motions do not tell apart stays exactly so.
     """
     top, H, shares = solved
-    motions = np.stack([p.motion for p in passages])
+    motions = np.stack([p.move.motion for p in passages])
     # drift = B xi with B orthogonal, in units too: it turns angles into angles and shifts into shifts.
     turn = np.eye(7)
     turn[:6, :6] = se3.vehicle_block(place.R_vehicle_cam)
@@ -198,13 +209,13 @@ def _joined(
     theta[:6], theta[LENS] = (turn @ top)[:6], top[6]
     pull = slopes.sum(axis=0) + curvature @ theta
     return Section(
-        from_ns=passages[0].frame.stamp_ns,
-        to_ns=passages[-1].frame.stamp_ns,
+        from_ns=passages[0].move.stamp_ns,
+        to_ns=passages[-1].move.stamp_ns,
         curvature=curvature / np.outer(_ALL_UNITS, _ALL_UNITS),
         pull=pull / _ALL_UNITS,
         certainty=np.linalg.inv(noise) * np.outer(_ALL_UNITS, _ALL_UNITS),
         motion=np.abs(motions).max(axis=0),
         speed=_speed(passages),
-        sync_s=float(np.mean([p.sync_s for p in passages])),
-        tracked=all(p.tracked for p in passages),
+        sync_s=float(np.mean([p.move.sync_s for p in passages])),
+        tracked=all(p.move.tracked for p in passages),
     )

@@ -5,16 +5,13 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from monitor.drift_summary import Calling, Cell, Honest, Share, Smallest, Summary
+from monitor.drift_summary import RECORDED, SIMULATED, Calling, Cell, Honest, Share, Smallest, Summary
 from monitor.outputs import write_whole
 from monitor.status import STATES
-from pipeline.drift_trials import CROPPED_PX, KINDS, MOVED_M, TURNED_DEG, Kind
+from pipeline.drift_trials import CROPPED_PX, MOVED_M, TURNED_DEG, Kind
 from pipeline.errors import CalibwatchError
 
 _TITLES: dict[Kind, str] = {
-    "healthy": "Nothing wrong.",
-    "combined": "Stored extrinsic turned by 0.5 to 1.2 deg about a random axis and moved by 0.1 to 0.2 m.",
-    "single": "Stored extrinsic wrong along one axis.",
     "compensating": "Two axes wrong that leave the bearing at 20 m as it was.",
     "ramp": "Drift that grows evenly from nothing to the end of the drive; told at any time.",
     "vibration": "A camera that shakes, with no drift: 'drifted' would be false.",
@@ -22,6 +19,7 @@ _TITLES: dict[Kind, str] = {
     "focal": "Wrong focal length, no drift: likewise.",
     "offline": "Axes of the camera, as in the published offline check.",
 }
+"""Of the kinds that have a table label by label."""
 
 
 def drift_text(found: Summary) -> str:
@@ -31,9 +29,10 @@ def drift_text(found: Summary) -> str:
         parts.append("\n".join(_callings(found.calling)))
     if found.smallest:
         parts.append("\n".join(_smallest(found.smallest)))
-    for kind in KINDS:
-        cells = [cell for cell in found.cells if cell.kind == kind]
-        if cells and kind not in ("healthy", "combined"):
+    widest = _widest(found)
+    for kind in _TITLES:
+        cells = [cell for cell in found.cells if cell.kind == kind and cell.group in widest]
+        if cells:
             parts.append("\n".join(_cells(kind, cells)))
     if found.honest:
         parts.append("\n".join(_honest(found.honest)))
@@ -78,6 +77,12 @@ def drift_csv(found: Summary) -> str:
     return out.getvalue()
 
 
+def _widest(found: Summary) -> set[str]:
+    """Groups that no other group holds: their drives stand in the CSV one by one."""
+    groups = {cell.group for cell in found.cells}
+    return groups & {RECORDED, SIMULATED} if RECORDED in groups else groups
+
+
 def _head(found: Summary) -> Iterator[str]:
     limits = "each rig's own alert limits"
     if found.header.limits is not None:
@@ -85,8 +90,9 @@ def _head(found: Summary) -> Iterator[str]:
         limits = f"alert limits {deg:g} deg and {m:g} m on every axis"
     baseline = "a baseline from the other drives" if found.header.baseline else "no baseline"
     deg, m = found.header.reference_sigma
+    drives = "1 drive" if len(found.drives) == 1 else f"{len(found.drives)} drives"
     yield (
-        f"{found.runs} runs on {len(found.drives)} drives (seed {found.header.seed}), {limits}, {baseline}; "
+        f"{found.runs} runs on {drives} (seed {found.header.seed}), {limits}, {baseline}; "
         f"recordings are taken to know their extrinsic to {deg:g} deg and {m:g} m."
     )
     yield (
@@ -134,7 +140,8 @@ def _smallest(rows: Sequence[Smallest]) -> Iterator[str]:
                     cells = " | ".join(_part(one.shares.get(amount)) for amount in amounts)
                     ends = f"{_number(one.told, unit)} | {_number(one.noticed, unit)}"
                     yield f"| {group} | {one.axis} | {cells} | {ends} |"
-        yield ""
+        if unit == "deg":
+            yield ""
 
 
 def _cells(kind: Kind, cells: Sequence[Cell]) -> Iterator[str]:

@@ -154,7 +154,7 @@ def stage(trial: Trial, true: Mount, frames: Sequence[FramePair], rng: np.random
     """
     G = _axes_elsewhere(rng)
     left, top, right, bottom = (int(n) for n in rng.integers(0, CROPPED_PX + 1, 4))
-    turns = _shaking(trial.shake_rad, len(frames), rng)
+    turns = shaking(trial.shake_rad, len(frames), rng)
     stored = true.T_cam_lidar
     if not trial.ramp:
         T = true.T_vehicle_lidar
@@ -167,8 +167,10 @@ def stage(trial: Trial, true: Mount, frames: Sequence[FramePair], rng: np.random
     )
 
     def told() -> Iterator[FramePair]:
-        for k, pair in enumerate(_late(frames, trial.late_ns)):
-            pixels = pair.image.pixels if turns is None else _turned(pair.image.pixels, true.camera, turns[k])
+        for k, pair in enumerate(late_images(frames, trial.late_ns)):
+            pixels = pair.image.pixels
+            if turns is not None:
+                pixels = turned_image(pixels, true.camera, turns[k])
             height, width = pixels.shape[:2]
             moved = G
             if trial.ramp:
@@ -203,7 +205,7 @@ def _mapped(cloud: PointCloud, T: Floats) -> PointCloud:
     return dataclasses.replace(cloud, xyz=se3.apply(T, cloud.xyz).astype(np.float32))
 
 
-def _shaking(rms: float, frames: int, rng: np.random.Generator) -> Floats | None:
+def shaking(rms: float, frames: int, rng: np.random.Generator) -> Floats | None:
     """Turn of the camera at each exposure (frames,3), rad, mean zero; None where it does not shake.
 
     Slower frames see a fast shake as turns that have nothing to do with each other.
@@ -214,7 +216,7 @@ def _shaking(rms: float, frames: int, rng: np.random.Generator) -> Floats | None
     return np.asarray(turns - turns.mean(axis=0), dtype=np.float64)
 
 
-def _turned(pixels: np.ndarray, camera: CameraModel, turn: Floats) -> np.ndarray:
+def turned_image(pixels: np.ndarray, camera: CameraModel, turn: Floats) -> np.ndarray:
     """What the camera sees when it is turned about its centre by ``turn`` (3,), rad, camera axes."""
     columns = np.append(np.arange(0, camera.width - 1, _GRID_PX), camera.width - 1)
     rows = np.append(np.arange(0, camera.height - 1, _GRID_PX), camera.height - 1)
@@ -239,7 +241,7 @@ def _turned(pixels: np.ndarray, camera: CameraModel, turn: Floats) -> np.ndarray
     )
 
 
-def _late(frames: Sequence[FramePair], late_ns: int) -> list[FramePair]:
+def late_images(frames: Sequence[FramePair], late_ns: int) -> list[FramePair]:
     """The pairs that are made when images bear stamps that are ``late_ns`` too late.
 
     A sweep goes with the image whose stamp now lies where that of its own image lay, each with its nearest;

@@ -1,4 +1,4 @@
-"""Honesty of covariances: answers drawn from known distributions get the figures that belong to them."""
+"""Honesty of covariances, intervals and curves: known distributions get the figures that belong to them."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.error_statistics import beyond, honesty, mean_absolute, normalised_square
+from pipeline.error_statistics import (
+    balance,
+    beyond,
+    clopper_pearson,
+    honesty,
+    mean_absolute,
+    normalised_square,
+    roc,
+)
 
 EXACT = np.zeros(6)
 
@@ -91,3 +99,59 @@ def test_ratios_count_in_both_uncertainties():
     ratio = beyond(np.array([5.0] * 6), np.array([3.0] * 6), np.array([4.0] * 6), np.arange(6) < 3)
     assert ratio[:3] == pytest.approx(1.0)
     assert np.isnan(ratio[3:]).all()
+
+
+@pytest.mark.parametrize(("hits", "of"), [(0, 40), (1, 40), (13, 40), (39, 40), (40, 40), (0, 1)])
+def test_intervals_of_shares_leave_as_little_as_they_say(hits, of):
+    """By the definition: at each end so many hits or more (fewer) have half of what is left."""
+    low, high = clopper_pearson(hits, of)
+    assert 0.0 <= low <= hits / of <= high <= 1.0
+    if hits > 0:
+        assert stats.binom.sf(hits - 1, of, low) == pytest.approx(0.025)
+    else:
+        assert low == 0.0
+    if hits < of:
+        assert stats.binom.cdf(hits, of, high) == pytest.approx(0.025)
+    else:
+        assert high == 1.0
+    if hits == 0:
+        assert high == pytest.approx(1.0 - 0.025 ** (1.0 / of))
+
+
+def test_of_nothing_any_share_may_be():
+    assert clopper_pearson(0, 0) == (0.0, 1.0)
+
+
+def test_balanced_accuracy_weighs_both_kinds_alike():
+    found = balance((9, 10), (100, 200))
+    assert found.accuracy == pytest.approx(0.7)
+    assert found.low == pytest.approx(
+        0.5 * (clopper_pearson(9, 10, 0.975)[0] + clopper_pearson(100, 200, 0.975)[0])
+    )
+    assert found.low < 0.7 < found.high
+    assert balance((0, 0), (5, 5)) is None
+    assert balance((5, 5), (0, 0)) is None
+
+
+_SCORES = st.lists(st.integers(0, 6).map(float), min_size=1, max_size=12)
+
+
+@given(_SCORES, _SCORES)
+def test_the_curve_is_that_of_all_thresholds(healthy, wrong):
+    """Area by comparing every pair, best accuracy by trying every threshold."""
+    found = roc(healthy, wrong)
+    pairs = [(w > h) + 0.5 * (w == h) for w in wrong for h in healthy]
+    assert found.area == pytest.approx(np.mean(pairs))
+    tried = [
+        0.5 * (np.mean([w >= t for w in wrong]) + np.mean([h < t for h in healthy]))
+        for t in [*healthy, *wrong, np.inf]
+    ]
+    assert found.best == pytest.approx(max(tried))
+    assert (found.false[0], found.found[0], found.false[-1], found.found[-1]) == (0, 0, 1, 1)
+    assert (np.diff(found.false) >= 0).all()
+    assert (np.diff(found.found) >= 0).all()
+
+
+def test_a_curve_needs_both_kinds():
+    assert roc([], [1.0]) is None
+    assert roc([1.0], []) is None

@@ -100,6 +100,7 @@ def mount_of(pair: RigPair) -> Mount:
         limits=pair.limits,
         required=pair.required,
         spin=pair.lidar.spin,
+        baseline=pair.baseline,
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import zenoh
 
 from monitor import bus
+from monitor.baseline_file import with_baselines
 from monitor.clock import Clock
 from monitor.daemon import watch, watching
 from monitor.discovery import Survey, survey_in
@@ -79,7 +80,7 @@ def run(
         complete = _completed(rig, lambda: _survey(session, rig, now_ns, stop), stop)
         if complete is None:
             return "starting"
-        rig = complete
+        rig = with_baselines(complete, None)
         if out is not None:
             _make(out)
         surroundings = Surroundings(rig.vehicle, folder=out, session=session, images_hz=images_hz)

@@ -36,7 +36,12 @@ class Prepared:
 
 
 def prepare(
-    location: str, rig_file: Path | None, drift: Floats | None, *, needs_extrinsic: bool = True
+    location: str,
+    rig_file: Path | None,
+    drift: Floats | None,
+    *,
+    needs_extrinsic: bool = True,
+    known: Callable[[Rig], Rig] = lambda rig: rig,
 ) -> Prepared:
     """The rig for a recording: from ``rig_file``, else from the recording itself.
 
@@ -45,6 +50,7 @@ def prepare(
         rig_file: A rig file or ``calib.json``, or None.
         drift: float64 (6,), altered into every stored extrinsic (``--inject``), or None.
         needs_extrinsic: False leaves it open where neither rig nor recording tells it.
+        known: Adds what else is known of the complete rig, under the extrinsics as they are stored.
 
     Raises:
         InputError: The recording can not be read or does not hold what the rig names.
@@ -63,10 +69,11 @@ def prepare(
                 ("rig from the folder",),
             )
         else:
-            return Prepared(*_with_drift(*_discovered(source, topics, location), drift))
+            found, found_notes = _discovered(source, topics, location)
+            return Prepared(*_with_drift(known(found), found_notes, drift))
     _check_types(rig, topics, location)
     rig = completed(rig, lambda: _survey(location, topics), needs_extrinsic=needs_extrinsic)
-    return Prepared(*_with_drift(rig, notes, drift))
+    return Prepared(*_with_drift(known(rig), notes, drift))
 
 
 def _check_types(rig: Rig, topics: Sequence[TopicInfo], location: str) -> None:

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from monitor.baseline_file import with_baselines
 from monitor.bus_replay import OverBus
 from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
@@ -36,6 +37,7 @@ def replay(
     over_zenoh: bool,
     stop: threading.Event,
     progress: Callable[[int], None] | None,
+    baseline: Path | None = None,
 ) -> Summary:
     """Judges a recording and writes its files into ``out``.
 
@@ -49,11 +51,12 @@ def replay(
         over_zenoh: Whether messages go through a zenoh session.
         stop: Ends the run early.
         progress: Told the number of pairs.
+        baseline: File of a baseline, or None: those that the rig names.
 
     Raises:
         CalibwatchError: The recording, rig or model can not be used; no file then looks whole.
     """
-    prepared = prepare(location, rig_file, drift)
+    prepared = prepare(location, rig_file, drift, known=lambda rig: with_baselines(rig, baseline))
     segmenter = Segmenter(model_bytes(model))
     outputs = _opened(out, prepared.rig.vehicle, images_hz)
     try:

@@ -28,6 +28,7 @@ from monitor.rig_document import (
     validated,
 )
 from monitor.sources import TopicInfo
+from pipeline.baseline import Baseline
 from pipeline.cameras import lens_of
 from pipeline.errors import CalibwatchError, InputError, RigError
 from pipeline.records import AXES, CameraModel, Floats
@@ -110,6 +111,8 @@ class RigPair:
         required: Axes that must be monitored for 'healthy'.
         max_gap_ns: Largest gap between a sweep's middle and its image, ns.
         pairing: Whether stamps or sequence numbers tell what belongs together.
+        baseline_file: File of the pair's baseline, or None.
+        baseline: What that file says, once it was read (:mod:`monitor.baseline_file`), or None.
     """
 
     name: str
@@ -124,6 +127,8 @@ class RigPair:
     required: tuple[Axis, ...]
     max_gap_ns: int
     pairing: Pairing
+    baseline_file: Path | None = None
+    baseline: Baseline | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +167,15 @@ def load_rig(path: str | Path) -> Rig:
         raise RigError(f"{path} is not {path.suffix.lstrip('.') or 'json'}: {error}") from error
     if not isinstance(document, dict):
         raise RigError(f"{path} holds no table", hint="a rig file has 'vehicle' and 'pairs'")
-    return parse_rig(document, where=str(path))
+    rig = parse_rig(document, where=str(path))
+    return dataclasses.replace(rig, pairs=tuple(_beside(pair, path.parent) for pair in rig.pairs))
+
+
+def _beside(pair: RigPair, folder: Path) -> RigPair:
+    """The pair, the file of its baseline sought from the folder of the rig file."""
+    if pair.baseline_file is None:
+        return pair
+    return dataclasses.replace(pair, baseline_file=folder / pair.baseline_file)
 
 
 def parse_rig(document: Mapping[str, object], *, where: str) -> Rig:
@@ -261,6 +274,7 @@ def _pair(section: PairSection, where: str) -> RigPair:
         required=tuple(section.required),
         max_gap_ns=round(section.max_gap_ms * 1e6),
         pairing=section.pairing,
+        baseline_file=None if section.baseline is None else Path(section.baseline.file),
     )
 
 

@@ -81,6 +81,16 @@ class ExtrinsicSection(_Section):
     )
 
 
+class BaselineSection(_Section):
+    """What healthy drives taught about the mount."""
+
+    file: str = Field(
+        min_length=1,
+        max_length=4096,
+        description="written by `calibwatch baseline`; relative to the folder of the rig file",
+    )
+
+
 class LimitsSection(_Section):
     """Alert limits: what matters to this vehicle's perception (AL of FORMULAS D3, per axis)."""
 
@@ -111,6 +121,9 @@ class PairSection(_Section):
     )
     extrinsic: ExtrinsicSection | None = Field(default=None, description="absent: taken from tf_static")
     T_vehicle_lidar: _Matrix4 | None = Field(default=None, description="maps LiDAR points into base_link")
+    baseline: BaselineSection | None = Field(
+        default=None, description="absent: drift is told relative to the stored extrinsic"
+    )
     limits: LimitsSection = LimitsSection()
     required: list[Axis] = Field(
         default=["pitch", "yaw"], min_length=1, description="axes that must be monitored for 'healthy'"
@@ -139,6 +152,7 @@ _SECTIONS: dict[str, type[_Section]] = {
     "lidar": LidarSection,
     "camera": CameraSection,
     "extrinsic": ExtrinsicSection,
+    "baseline": BaselineSection,
     "limits": LimitsSection,
 }
 

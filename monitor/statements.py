@@ -155,7 +155,11 @@ def _drift(mount: Mount, memory: verdict.Memory, belief: Belief | None) -> Drift
             monitored=bool(j.monitored[index]),
             last_seen_ns=memory.last_seen_ns[index],
         )
-    return Drift(axes="camera" if mount.T_vehicle_lidar is None else "vehicle", relative_to="stored", **axes)
+    return Drift(
+        axes="camera" if mount.T_vehicle_lidar is None else "vehicle",
+        relative_to="stored" if mount.baseline is None else "baseline",
+        **axes,
+    )
 
 
 def _consequence(mount: Mount, belief: Belief | None) -> tuple[Consequence, ...]:

@@ -42,6 +42,15 @@ def rig_option(function: Callable[..., object]) -> Callable[..., object]:
     )(function)
 
 
+def baseline_option(function: Callable[..., object]) -> Callable[..., object]:
+    """``--baseline FILE``."""
+    return click.option(
+        "--baseline",
+        type=click.Path(path_type=Path),
+        help="What `calibwatch baseline` learned of this rig; default: the file that the rig names, if any.",
+    )(function)
+
+
 def inject_option(function: Callable[..., object]) -> Callable[..., object]:
     """``--inject AXIS=VALUE,...``."""
     return click.option(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 )
 @click.argument("recording")
 @commands.rig_option
+@commands.baseline_option
 @commands.inject_option
 @click.option(
     "--out",
@@ -42,6 +43,7 @@ def command(
     *,
     recording: str,
     rig_file: Path | None,
+    baseline: Path | None,
     drift: "Floats | None",
     out: Path,
     over_zenoh: bool,
@@ -67,6 +69,7 @@ def command(
             over_zenoh=over_zenoh,
             stop=stop,
             progress=commands.progress_line("pairs judged:"),
+            baseline=baseline,
         )
     if as_json:
         click.echo(summary.model_dump_json(indent=2))

@@ -10,7 +10,7 @@ OUT ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: env demo test test-full lint bench train export scenes figures-masks figures-plk figures-crlf clean
+.PHONY: env demo test test-full lint bench train export scenes figures-masks figures-plk figures-crlf figures-drift clean
 
 env: $(STAMP)
 
@@ -97,6 +97,15 @@ figures-crlf: env
 	$(if $(wildcard $(CALIBWATCH_DATA)),$(BIN)/calibwatch evaluate dataset $(CALIBWATCH_DATA) $(KNOWN) --out $(OUT)/crlf/recorded)
 	$(BIN)/calibwatch evaluate basin --simulated 4 --out $(OUT)/crlf/basin
 	$(BIN)/python docs/crlf_page.py $(OUT)/crlf docs
+
+# Runs that were finished stand in $(OUT)/drift and are not run again: remove it after a change of the watch.
+# An hour or two of an idle core for the simulated drives, as much for each of the recordings.
+DRIVES ?= $(wildcard $(addprefix $(CALIBWATCH_DATA)/,kitti_raw_0009_a kitti_raw_sfnd kitti_raw_0005_a kitti_odom_03_a))
+figures-drift: env
+	$(BIN)/calibwatch evaluate drift --simulated 4 --runs 6 --out $(OUT)/drift/simulated
+	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --limits 0.5 0.1 --out $(OUT)/drift/limits)
+	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --kinds healthy,combined --out $(OUT)/drift/recorded)
+	$(BIN)/python docs/drift_page.py $(OUT)/drift docs
 
 clean:
 	rm -rf $(VENV) $(TRAIN) $(OUT) build *.egg-info

@@ -4,6 +4,7 @@ The score's slope and curvature by the mount and by a magnification of the image
 the time offset follow from each frame's own motion (G1).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,13 +16,12 @@ from pipeline.edge_score import NEW_SCENE_M, UNITS, EdgeBatch, EdgeFrame
 from pipeline.edge_witness import EdgeWitnessParameters
 from pipeline.records import CameraModel, Floats
 
-_ZOOM_UNIT = 0.005
-"""Half a percent moves the border of a wide image by as much as a quarter of a degree."""
+_UNITS = np.array([*UNITS, 0.005, 0.005])
+"""Of the eight unknowns, each about as much to the image: 5 ms are 5 cm at 10 m/s, half a percent moves the
+border of a wide image by a quarter of a degree."""
 
-_CLIMB_UNITS = np.array([*UNITS, _ZOOM_UNIT])
-
-_ALL_UNITS = np.array([*UNITS, 0.005, _ZOOM_UNIT])
-"""The units of all unknowns; 5 ms are 5 cm at 10 m/s."""
+_SEEN = [0, 1, 2, 3, 4, 5, LENS]
+"""Unknowns whose curvature the score itself tells; that of the delay follows from the motion."""
 
 _OTHER_SPEED_M_S = 2.0
 """m/s; frames driven so differently from the last section tell clock from mount on the same road."""
@@ -112,110 +112,116 @@ def linearised(
         parameters: Of the edge witness.
     """
     batch = edge_score.batch_of([p.frame for p in passages], place.camera, parameters.most_edges)
-    zoomed = _Zoomed(batch, place.T_expected)
-    x = np.array([*xi, 0.0]) / _CLIMB_UNITS
-    H = _curvature(zoomed, x, parameters)
-    top = _climbed(zoomed, x, H, parameters)
+    B = se3.vehicle_block(place.R_vehicle_cam)
+    score = _Score(batch, place.T_expected, np.stack([p.move.motion for p in passages]) @ B)
+    x = np.array([*xi, 0.0, 0.0]) / _UNITS
+    H = _curvature(score, x, parameters)
+    top = _climbed(score, x, H, parameters)
     if float(np.linalg.norm(top - x)) > parameters.difference:
-        H = _curvature(zoomed, top, parameters)
-    return _joined(passages, batch, (top, H, zoomed.shares(top)), place, parameters)
-
-
-class _Zoomed:
-    """The score of a batch by (phi, rho, log f), in units.
-
-    A longer focal length magnifies what lies about the optical axis; lenses bend little enough there for the
-    points of the camera frame to be spread instead.
-    """
-
-    def __init__(self, batch: EdgeBatch, T_expected: Floats) -> None:
-        self._batch = batch
-        self._T = T_expected
-
-    def shares(self, x: Floats) -> Floats:
-        """Each edge's share (N,7) of the gradient at ``x``."""
-        return self._shares(x)[1]
-
-    def loss(self, x: Floats) -> tuple[float, Floats]:
-        """Minus the score, and its gradient."""
-        value, shares = self._shares(x)
-        return -value, -shares.sum(axis=0)
-
-    def _shares(self, x: Floats) -> tuple[float, Floats]:
-        theta = x * _CLIMB_UNITS
-        T = se3.retract(self._T, theta[:6])
-        spread = np.array([np.exp(theta[6]), np.exp(theta[6]), 1.0])
-        value, _, share = edge_score.score(self._batch, np.diag([*spread, 1.0]) @ T, 0)
-        points = self._batch.position @ T[:3, :3].T + T[:3, 3]
-        by_point = share[:, 3:] * spread
-        by_zoom = (by_point[:, :2] * points[:, :2]).sum(axis=1)
-        shares = np.column_stack([np.cross(points, by_point), by_point, by_zoom])
-        return value, shares * _CLIMB_UNITS
-
-
-def _curvature(zoomed: _Zoomed, x: Floats, parameters: EdgeWitnessParameters) -> Floats:
-    """Minus the second derivative (7,7) by differences, made positive as for the estimate (PROBE 4)."""
-    H = np.empty((len(x), len(x)))
-    for row, step in zip(H, parameters.difference * np.eye(len(x)), strict=True):
-        row[:] = (zoomed.loss(x + step)[1] - zoomed.loss(x - step)[1]) / (2.0 * parameters.difference)
-    values, vectors = np.linalg.eigh(0.5 * (H + H.T))
-    values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
-    return np.asarray((vectors * values) @ vectors.T, dtype=np.float64)
-
-
-def _climbed(zoomed: _Zoomed, x: Floats, H: Floats, parameters: EdgeWitnessParameters) -> Floats:
-    """The top of the score near ``x``."""
-    start = zoomed.loss(x)
-    top, _ = trust_region.descend(zoomed.loss, x, start, H, parameters.step_limits[0], parameters.search)
-    return top
-
-
-def _joined(
-    passages: Sequence[Passage],
-    batch: EdgeBatch,
-    solved: tuple[Floats, Floats, Floats],
-    place: Place,
-    parameters: EdgeWitnessParameters,
-) -> Section:
-    """Every frame's slope by the eight unknowns, from (top, curvature, shares) by the seven, in units.
-
-    All frames of a section see the same road: they share its curvature by the weight of their edges, so that
-    what their motions do not tell apart stays exactly so.
-    """
-    top, H, shares = solved
-    motions = np.stack([p.move.motion for p in passages])
+        H = _curvature(score, top, parameters)
+    turn = np.eye(UNKNOWNS)
     # drift = B xi with B orthogonal, in units too: it turns angles into angles and shifts into shifts.
-    turn = np.eye(7)
-    turn[:6, :6] = se3.vehicle_block(place.R_vehicle_cam)
-    H, shares = turn @ H @ turn.T, shares @ turn.T
-    designs = np.zeros((len(passages), 7, UNKNOWNS))
-    designs[:, :6, :6] = np.eye(6)
-    designs[:, :6, CLOCK] = motions / UNITS * _ALL_UNITS[CLOCK]
-    designs[:, 6, LENS] = 1.0
-    weight = np.bincount(batch.slot, batch.weight, minlength=len(passages))
-    curvature = np.einsum("f,fai,ab,fbj->ij", weight / weight.sum(), designs, H, designs)
-    slopes = np.empty((len(batch), UNKNOWNS))
-    for slot, design in enumerate(designs):
-        mine = batch.slot == slot
-        slopes[mine] = shares[mine] @ design
-    cells = np.stack([np.bincount(batch.cell, column) for column in slopes.T])
-    common = np.zeros((UNKNOWNS, UNKNOWNS))
-    common[:6, :6] = place.floor
-    common[LENS, LENS] = place.zoom**2
-    common /= np.outer(_ALL_UNITS, _ALL_UNITS)
-    noise = parameters.sigma_factor**2 * cells @ cells.T + curvature @ common @ curvature
-    noise += _NULL * float(np.trace(noise)) * np.eye(UNKNOWNS)
-    theta = np.zeros(UNKNOWNS)
-    theta[:6], theta[LENS] = (turn @ top)[:6], top[6]
-    pull = slopes.sum(axis=0) + curvature @ theta
+    turn[:6, :6] = B
+    curvature, slopes = turn @ H @ turn.T, score.shares(top) @ turn.T
+    scale = np.outer(_UNITS, _UNITS)
+    noise = _noise(batch, slopes, curvature, place, parameters)
+    motions = np.stack([p.move.motion for p in passages])
     return Section(
         from_ns=passages[0].move.stamp_ns,
         to_ns=passages[-1].move.stamp_ns,
-        curvature=curvature / np.outer(_ALL_UNITS, _ALL_UNITS),
-        pull=pull / _ALL_UNITS,
-        certainty=np.linalg.inv(noise) * np.outer(_ALL_UNITS, _ALL_UNITS),
+        curvature=curvature / scale,
+        pull=(slopes.sum(axis=0) + curvature @ turn @ top) / _UNITS,
+        certainty=np.asarray(np.linalg.inv(noise) * scale, dtype=np.float64),
         motion=np.abs(motions).max(axis=0),
         speed=_speed(passages),
         sync_s=float(np.mean([p.move.sync_s for p in passages])),
         tracked=all(p.move.tracked for p in passages),
     )
+
+
+class _Score:
+    """The score of a batch by (phi, rho, delay, log f), in units, camera axes.
+
+    A longer focal length magnifies what lies about the optical axis; lenses bend little enough there for the
+    points of the camera frame to be spread instead.
+
+    Args:
+        batch: Edges and gradients.
+        T_expected: float64 (4,4), where the unknowns are zero.
+        rates: float64 (frames,6), xi that a second of delay feigns in each frame (FORMULAS G1).
+    """
+
+    def __init__(self, batch: EdgeBatch, T_expected: Floats, rates: Floats) -> None:
+        self._batch = batch
+        self._T = T_expected
+        points = batch.position @ T_expected[:3, :3].T + T_expected[:3, 3]
+        turning, moving = rates[batch.slot, :3], rates[batch.slot, 3:]
+        self._flow = (np.cross(turning, points) + moving) @ T_expected[:3, :3]
+        weight = np.bincount(batch.slot, batch.weight, minlength=len(rates))
+        self.weight = weight / weight.sum()
+        self.rates = rates / _UNITS[:6] * _UNITS[CLOCK]
+
+    def loss(self, x: Floats) -> tuple[float, Floats]:
+        """Minus the score, and its gradient (8,)."""
+        value, shares = self._seen(x)
+        return -value, -shares.sum(axis=0)
+
+    def shares(self, x: Floats) -> Floats:
+        """Each edge's share (N,8) of the gradient at ``x``."""
+        return self._seen(x)[1]
+
+    def _seen(self, x: Floats) -> tuple[float, Floats]:
+        theta = x * _UNITS
+        T = se3.retract(self._T, theta[:6])
+        spread = np.array([np.exp(theta[LENS]), np.exp(theta[LENS]), 1.0])
+        position = np.asfortranarray(self._batch.position + theta[CLOCK] * self._flow)
+        batch = dataclasses.replace(self._batch, position=position)
+        value, _, share = edge_score.score(batch, np.diag([*spread, 1.0]) @ T, 0)
+        points = position @ T[:3, :3].T + T[:3, 3]
+        by_point = share[:, 3:] * spread
+        by_xi = np.hstack([np.cross(points, by_point), by_point]) * _UNITS[:6]
+        by_delay = np.einsum("ni,ni->n", by_xi, self.rates[batch.slot])
+        by_zoom = (by_point[:, :2] * points[:, :2]).sum(axis=1) * _UNITS[LENS]
+        return value, np.column_stack([by_xi, by_delay, by_zoom])
+
+
+def _curvature(score: _Score, x: Floats, parameters: EdgeWitnessParameters) -> Floats:
+    """Minus the second derivative (8,8), made positive as for the estimate (PROBE 4).
+
+    By differences for mount and lens. All frames of a section see the same road: they share this curvature by
+    the weight of their edges, so that a delay which their motions do not tell from a mount stays untold.
+    """
+    H = np.empty((len(_SEEN), len(_SEEN)))
+    for row, place in zip(H, _SEEN, strict=True):
+        step = parameters.difference * np.eye(UNKNOWNS)[place]
+        row[:] = (score.loss(x + step)[1] - score.loss(x - step)[1])[_SEEN] / (2.0 * parameters.difference)
+    values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+    values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
+    designs = np.zeros((len(score.rates), len(_SEEN), UNKNOWNS))
+    designs[:, range(len(_SEEN)), _SEEN] = 1.0
+    designs[:, :6, CLOCK] = score.rates
+    seen = (vectors * values) @ vectors.T
+    return np.asarray(np.einsum("f,fai,ab,fbj->ij", score.weight, designs, seen, designs), dtype=np.float64)
+
+
+def _climbed(score: _Score, x: Floats, H: Floats, parameters: EdgeWitnessParameters) -> Floats:
+    """The top of the score near ``x``."""
+    # What nothing tells must not be walked along.
+    H = H + parameters.eigenvalue_floor * float(np.trace(H)) / UNKNOWNS * np.eye(UNKNOWNS)
+    top, _ = trust_region.descend(
+        score.loss, x, score.loss(x), H, parameters.step_limits[0], parameters.search
+    )
+    return top
+
+
+def _noise(
+    batch: EdgeBatch, slopes: Floats, curvature: Floats, place: Place, parameters: EdgeWitnessParameters
+) -> Floats:
+    """Covariance (8,8) of the slope: cells are the witnesses (PROBE 4), and streets differ by the floor."""
+    cells = np.stack([np.bincount(batch.cell, column) for column in slopes.T])
+    common = np.zeros((UNKNOWNS, UNKNOWNS))
+    common[:6, :6] = place.floor
+    common[LENS, LENS] = place.zoom**2
+    common /= np.outer(_UNITS, _UNITS)
+    noise = parameters.sigma_factor**2 * cells @ cells.T + curvature @ common @ curvature
+    return np.asarray(noise + _NULL * float(np.trace(noise)) * np.eye(UNKNOWNS), dtype=np.float64)

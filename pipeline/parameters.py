@@ -6,6 +6,7 @@ from pipeline.drift_test import DriftTestParameters
 from pipeline.edge_witness import EdgeWitnessParameters
 from pipeline.edges import EdgeParameters
 from pipeline.masks import MaskParameters
+from pipeline.traces import TraceParameters
 from pipeline.verdict import VerdictParameters
 from pipeline.window import WindowParameters
 
@@ -23,6 +24,7 @@ class Parameters:
         window: Which frames stay, and when they are judged.
         test: Thresholds of the drift test.
         verdict: Hysteresis and patience.
+        traces: How much of the past is kept to tell when a drift began.
         seed: Of the random numbers that RANSAC and the contrast draw.
     """
 
@@ -33,4 +35,5 @@ class Parameters:
     window: WindowParameters = field(default_factory=WindowParameters)
     test: DriftTestParameters = field(default_factory=DriftTestParameters)
     verdict: VerdictParameters = field(default_factory=VerdictParameters)
+    traces: TraceParameters = field(default_factory=TraceParameters)
     seed: int = 20_260

@@ -14,6 +14,8 @@ import numpy as np
 
 from pipeline import line_witness, verdict, window
 from pipeline.belief import Belief, believe
+from pipeline.dating import Dating
+from pipeline.drift_test import Expectation
 from pipeline.edge_witness import EdgeFrame
 from pipeline.edges import RING_JUMP, find_edges
 from pipeline.ego import Ego
@@ -90,6 +92,7 @@ class Watch:
         self._origin: Floats | None = None
         self._edge_frames: deque[EdgeFrame] = deque()
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
+        self._dating = Dating(mount.camera, parameters.traces)
         self._begun_ns = 0
         self._judged_ns: int | None = None
         self._lines_ns: int | None = None
@@ -135,8 +138,24 @@ class Watch:
             self.memory = verdict.start(now_ns)
         if self.belief is None and (self._edge_frames or self._line_frames):
             self.belief = self._believe()
-        judgement = self.belief.judgement if self.belief is not None else None
+        judgement = None
+        if self.belief is not None:
+            judgement = self.belief.judgement
+            self.memory = self._dating.redated(self.memory, self.mount, self._expectation(), self.belief)
         self.memory = verdict.finish(self.memory, judgement, self._count, self.mount.required)
+
+    def acknowledge(self, now_ns: int) -> bool:
+        """A person has taken note of the drift: evidence is collected anew; False where none is told."""
+        if self.memory is None or self.memory.severity is None:
+            return False
+        self.memory = verdict.acknowledge(self.memory, now_ns)
+        self._forget()
+        self._dating = Dating(self.mount.camera, self.parameters.traces)
+        self._begun_ns = now_ns
+        return True
+
+    def _expectation(self) -> Expectation:
+        return self.mount.expectation(self.mount.thresholds(self.parameters.test))
 
     def _enter(self, now_ns: int) -> None:
         """Brings clock and memory to a new pair; a clock that runs back starts a new window."""
@@ -189,6 +208,7 @@ class Watch:
                     pair.image_stamp_ns, edges, gradients, straight.distance_m, self.mount.feigned(straight)
                 )
             )
+            self._dating.see(self._edge_frames[-1])
         found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
         dropped: DropReason | None = None
         if not enough and not found_lines:
@@ -271,6 +291,9 @@ class Watch:
             self.mount.required,
             self.mount.limits,
             self.parameters.verdict,
+        )
+        self.memory = self._dating.dated(
+            self.memory, self.mount, self._expectation(), self.belief, self._shown_since()
         )
         return Findings(
             None, findings.cloud, findings.edge_points, findings.masks, findings.lines, judged=True

@@ -163,10 +163,11 @@ def learned_from(mount: Mount, drives: Sequence[Drive], pair: str) -> Learned:
         )
     _refuse_unhealthy(mount, usable, pair)
     _refuse_twins(usable, pair)
-    parameters = Parameters().test
-    baseline = learn([drive.estimates for drive in usable], parameters, WANTED_S)
-    others = left_out(baseline.stretches, parameters)
-    _refuse_stranger(others, parameters.alarm, pair)
+    parameters = Parameters()
+    rng = np.random.default_rng(parameters.seed)
+    baseline = learn([drive.estimates for drive in usable], parameters.test, WANTED_S, rng)
+    others = left_out(baseline.stretches, parameters.test)
+    _refuse_stranger(others, parameters.test.alarm, pair)
     return Learned(mount, baseline, others, unused)
 
 

@@ -89,7 +89,7 @@ class Baseline:
 def tolerance_factor(count: int) -> float:
     """Standard deviations of ``count`` samples that hold 95 % of all others with 95 % confidence (Howe).
 
-    37.7 for two samples, 9.9 for three, 3.4 for ten, 2.2 for two hundred: few streets narrow no bound.
+    38 for two samples, 10 for three, 3.4 for ten, 2.1 for two hundred: few streets narrow no bound.
     """
     quantile = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
     low = float(special.chdtri(count - 1, _CONFIDENCE))
@@ -112,13 +112,19 @@ def supported_floor(spread: Floats, floor: Floats, count: int) -> Floats:
     return np.asarray((scaled * values) @ scaled.T, dtype=np.float64)
 
 
-def learn(drives: Sequence[WindowEstimates], parameters: DriftTestParameters, wanted_s: float) -> Baseline:
+def learn(
+    drives: Sequence[WindowEstimates],
+    parameters: DriftTestParameters,
+    wanted_s: float,
+    rng: np.random.Generator,
+) -> Baseline:
     """Learns from the window estimates of healthy drives; their order does not matter.
 
     Args:
         drives: One per recording, names unique, each with at least one window.
         parameters: Of the test: its floor is what the spread is drawn towards.
         wanted_s: Wanted run length between two false alarms, s.
+        rng: Draws the bootstrap of the threshold.
 
     Raises:
         InputError: There is no window at all.
@@ -144,6 +150,7 @@ def learn(drives: Sequence[WindowEstimates], parameters: DriftTestParameters, wa
             _largest_statistics(parts, stretches, scatter, parameters),
             np.array([stretch.seconds for stretch in stretches]),
             wanted_s,
+            rng,
         ),
     )
 

@@ -47,13 +47,14 @@ class Tail:
     interval: tuple[float, float] | None
 
 
-def tail_of(values: Floats, seconds: Floats, wanted_s: float) -> Tail:
+def tail_of(values: Floats, seconds: Floats, wanted_s: float, rng: np.random.Generator) -> Tail:
     """The tail of the stretches' largest values.
 
     Args:
         values: float64 (N,), the largest value of each stretch; in any order, it does not matter.
         seconds: float64 (M,), durations of stretches, s: their mean is the time of one block.
         wanted_s: Wanted run length, s.
+        rng: Draws the bootstrap samples.
     """
     block_s = max(float(np.mean(seconds)), 1.0)
     needed = stretches_needed(wanted_s / block_s)
@@ -61,7 +62,6 @@ def tail_of(values: Floats, seconds: Floats, wanted_s: float) -> Tail:
     if len(values) < needed or not _exponential(np.sort(values)):
         return Tail(len(values), needed, wanted_s, largest, None, None)
     ordered = np.sort(values)
-    rng = np.random.default_rng(len(values))
     drawn = np.sort(rng.choice(ordered, (_RESAMPLES, len(ordered))), axis=1)
     thresholds = np.array([_extrapolated(sample, wanted_s / block_s) for sample in drawn])
     low, high = np.quantile(thresholds, [0.025, 0.975])

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.road_samples import (
+    STRETCH_M,
+    Scatter,
+    WindowEstimates,
+    effective_samples,
+    sample_of,
+    scatter_of,
+    stretches_of,
+)
+from tests.pipeline.simulated_windows import RANDOM, simulated_drive
+
+
+def windows(way_m, span_m=30.0, drift=None, covariance=RANDOM):
+    """Windows that end at ``way_m``, healthy unless told."""
+    end = np.asarray(way_m, dtype=np.float64)
+    count = len(end)
+    return WindowEstimates(
+        "drive",
+        np.zeros((count, 6)) if drift is None else drift,
+        np.broadcast_to(covariance, (count, 6, 6)),
+        np.zeros((count, 6)),
+        np.stack([end - span_m, end], axis=1),
+        (end * 1e8).astype(np.int64),
+    )
+
+
+def test_windows_far_apart_are_independent_and_windows_of_one_place_are_one():
+    assert effective_samples(np.arange(10) * 1e6, 20.0) == pytest.approx(10.0)
+    assert effective_samples(np.zeros(10), 20.0) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("phi", [0.3, 0.5, 0.8])
+def test_the_worth_of_a_long_drive_is_that_of_the_long_run_variance(phi):
+    step, length = 10.0, -10.0 / np.log(phi)
+    count = 3000
+    worth = effective_samples(np.arange(count) * step, length)
+    assert worth / count == pytest.approx((1 - phi) / (1 + phi), rel=0.01)  # FORMULAS F1
+
+
+def test_noise_and_correlation_of_simulated_drives_are_recovered():
+    rng = np.random.default_rng(1)
+    parts = [
+        simulated_drive(rng, f"{i}", noise=1.7, correlation_m=50.0, way_m=900.0, step_m=6.0)
+        for i in range(20)
+    ]
+    found = scatter_of(parts)
+    assert found.noise == pytest.approx(1.7, rel=0.06)
+    assert found.correlation_m == pytest.approx(50.0, rel=0.2)
+
+
+def test_two_windows_that_differ_much_do_not_prove_the_stated_sigma_wrong():
+    drift = np.zeros((2, 6))
+    drift[1] = 4.0 * np.sqrt(np.diag(RANDOM))
+    assert 1.0 < scatter_of([windows([100.0, 200.0], drift=drift)]).noise < 2.0
+
+
+def test_single_windows_tell_nothing_of_the_noise():
+    assert scatter_of([windows([50.0]), windows([80.0])]).noise == 1.0
+
+
+def test_windows_are_alike_at_least_over_half_their_length():
+    rng = np.random.default_rng(2)
+    parts = [
+        simulated_drive(rng, f"{i}", correlation_m=1.0, way_m=900.0, step_m=30.0, window_m=120.0)
+        for i in range(5)
+    ]
+    assert scatter_of(parts).correlation_m == pytest.approx(60.0)
+
+
+def test_the_error_of_a_mean_is_that_of_the_model():
+    """Against the covariance of the weighted mean, spelt out window by window."""
+    rng = np.random.default_rng(3)
+    way = np.array([40.0, 55.0, 90.0, 130.0])
+    factors = rng.uniform(0.5, 2.0, 4)
+    covariance = factors[:, None, None] * RANDOM
+    part = windows(way, drift=rng.normal(size=(4, 6)) * 1e-3, covariance=covariance)
+    sample = sample_of(part, Scatter(noise=1.3, correlation_m=35.0))
+    weights = (1 / factors) / (1 / factors).sum()
+    assert sample.mean == pytest.approx(weights @ part.drift)
+    variance = sum(
+        weights[i] * weights[j] * np.sqrt(factors[i] * factors[j]) * np.exp(-abs(way[i] - way[j]) / 35.0)
+        for i in range(4)
+        for j in range(4)
+    )
+    assert sample.covariance == pytest.approx(1.3**2 * variance * RANDOM)
+    assert sample.windows == 4
+    assert 1.0 < sample.samples < 4.0
+
+
+def test_an_error_of_the_clocks_is_not_averaged_away():
+    part = windows(np.arange(100) * 50.0)
+    clock = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+    fooled = WindowEstimates(
+        "drive", part.drift, part.covariance, np.tile(clock, (100, 1)), part.way_m, part.stamp_ns
+    )
+    assert sample_of(fooled, Scatter(1.0, 20.0)).covariance[3, 3] > 0.1**2
+
+
+@given(
+    steps=st.lists(st.floats(0.0, 60.0), min_size=1, max_size=120),
+    span=st.floats(0.0, 150.0),
+)
+def test_stretches_share_no_frame_and_are_long_enough(steps, span):
+    end = np.cumsum(steps) + span
+    parts = stretches_of(windows(end, span))
+    assert parts
+    for before, after in zip(parts, parts[1:], strict=False):
+        assert after.way_m[:, 0].min() >= before.way_m[:, 1].max() - 1e-6
+    way = end[-1] - (end[0] - span)
+    assert len(parts) <= max(1, way / STRETCH_M, 1)
+    for part in parts:
+        assert (np.diff(part.way_m[:, 1]) >= 1.0 - 1e-9).all()
+
+
+def test_a_vehicle_that_stands_gives_one_window():
+    (part,) = stretches_of(windows(np.full(50, 30.0)))
+    assert len(part) == 1
+
+
+def test_a_drive_without_windows_gives_no_stretch():
+    assert stretches_of(windows([])) == []

@@ -51,6 +51,7 @@ def believe(
     parameters: Parameters,
     edge_frames: Sequence[EdgeFrame],
     line_frames: Sequence[LineFrame],
+    scenes: int = 0,
     trail: Trail | None = None,
 ) -> Belief | None:
     """Solves the window, fuses the witnesses, tests the extrinsic that is expected to hold.
@@ -60,12 +61,13 @@ def believe(
         parameters: Settings.
         edge_frames: The window's frames with edges, ascending in time.
         line_frames: The window's frames with lines, likewise.
+        scenes: Scenes of the drive that lie behind: the more, the rarer each window may alarm by chance.
         trail: What the edge witness left of the window before, or None.
 
     Returns:
         What is believed of the mount, or None where neither witness says anything.
     """
-    test = parameters.test
+    test = mount.thresholds(drift_test.at_chance(parameters.test, parameters.scenes.budget, scenes + 1))
     R_vc = mount.R_vehicle_cam
     B = se3.vehicle_block(R_vc)
     expectation = mount.expectation(test)
@@ -90,7 +92,7 @@ def believe(
     T_estimated = se3.retract(T_expected, B.T @ fused.drift)
     evidence = Evidence(
         drift=se3.mount_drift(T_expected, T_estimated, R_vc),
-        covariance=fused.covariance(),
+        covariance=mount.noise**2 * fused.covariance(),
         loss=np.inf if edges is None else edges.loss,
         contrast=np.inf if edges is None else edges.contrast,
         peak=np.inf if edges is None else edges.peak,

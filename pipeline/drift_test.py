@@ -5,13 +5,18 @@ the systematic floor between scenes (measured on drives of one calibration, PROB
 extrinsic's own uncertainty. The last one widens the claim 'it moved', not the protection level.
 """
 
+import dataclasses
+import functools
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.stats import chi2, ncx2
 
-from pipeline.records import Floats, read_only
+from pipeline.records import AXES, Floats, read_only
+from pipeline.run_length import AlarmBudget
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,9 +25,8 @@ class DriftTestParameters:
 
     Attributes:
         alarm: Joint statistic above which a window alone says 'moved': chi-square, 6 degrees of freedom, at
-            1e-4.
+            1e-4, which is for the first scene of a drive; :func:`at_chance` raises it for later ones.
         suspicion: The same at 1e-3: more evidence is wanted.
-        noncentrality: Squared drift in sigma that exceeds ``alarm`` with probability 0.99 (6 dof).
         least_loss: Share of the best score that must be lost when the stored extrinsic may only move inside
             the floor: half as much again as the largest of 300 healthy windows on four drives (PROBE 5).
         suspicious_loss: Loss that is suspicious whatever the joint statistic says.
@@ -48,7 +52,6 @@ class DriftTestParameters:
 
     alarm: float = 27.86
     suspicion: float = 22.46
-    noncentrality: float = 51.8
     least_loss: float = 0.03
     suspicious_loss: float = 0.10
     least_contrast: float = 0.15
@@ -179,6 +182,32 @@ def expectation_of_stored(sigma_rad: float, sigma_m: float, parameters: DriftTes
     return Expectation(np.zeros(6), covariance, parameters.floor(), parameters.bound())
 
 
+_NOTICED = 0.99
+"""Chance with which a drift that is called detectable is noticed."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _noncentrality(alarm: float) -> float:
+    """Squared drift in sigmas that exceeds ``alarm`` with chance ``_NOTICED`` (F2): 51.8 at 27.86."""
+
+    def excess(noncentrality: float) -> float:
+        return float(ncx2.sf(alarm, len(AXES), noncentrality)) - _NOTICED
+
+    return float(brentq(excess, 1e-6, 4.0 * alarm + 100.0, xtol=1e-3))
+
+
+def at_chance(parameters: DriftTestParameters, budget: AlarmBudget, scene: int) -> DriftTestParameters:
+    """The test for one window in scene number ``scene`` (1 is the first) of a drive."""
+    alarm, suspicion = _levels(budget, min(scene, budget.settled))
+    return dataclasses.replace(parameters, alarm=alarm, suspicion=suspicion)
+
+
+@functools.lru_cache(maxsize=1024)
+def _levels(budget: AlarmBudget, scene: int) -> tuple[float, float]:
+    chance = budget.chance(scene)
+    return float(chi2.isf(chance, len(AXES))), float(chi2.isf(budget.suspicion_factor * chance, len(AXES)))
+
+
 def judge(
     evidence: Evidence, expectation: Expectation, limits: Floats, parameters: DriftTestParameters
 ) -> Judgement:
@@ -205,7 +234,7 @@ def judge(
         drift=evidence.drift,
         sigma=sigma,
         protection_level=protection,
-        detectable=np.sqrt(parameters.noncentrality / np.diag(P_inverse)),
+        detectable=np.sqrt(_noncentrality(parameters.alarm) / np.diag(P_inverse)),
         observable=seen & (sigma <= parameters.most_sigma * limits),
         monitored=seen & (protection <= limits),
         excluded=np.abs(evidence.drift) + parameters.K_md * sigma + bound <= limits,

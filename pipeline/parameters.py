@@ -6,6 +6,7 @@ from pipeline.drift_test import DriftTestParameters
 from pipeline.edge_witness import EdgeWitnessParameters
 from pipeline.edges import EdgeParameters
 from pipeline.masks import MaskParameters
+from pipeline.scene_sum import SceneSumParameters
 from pipeline.traces import TraceParameters
 from pipeline.verdict import VerdictParameters
 from pipeline.window import WindowParameters
@@ -23,6 +24,7 @@ class Parameters:
             and lines of neighbouring frames are the same lines.
         window: Which frames stay, and when they are judged.
         test: Thresholds of the drift test.
+        scenes: How all scenes of a drive are summed, and how often a false alarm may come.
         verdict: Hysteresis and patience.
         traces: How much of the past is kept to tell when a drift began.
         seed: Of the random numbers that RANSAC and the contrast draw.
@@ -34,6 +36,7 @@ class Parameters:
     lines_every_ns: int = 500_000_000
     window: WindowParameters = field(default_factory=WindowParameters)
     test: DriftTestParameters = field(default_factory=DriftTestParameters)
+    scenes: SceneSumParameters = field(default_factory=SceneSumParameters)
     verdict: VerdictParameters = field(default_factory=VerdictParameters)
     traces: TraceParameters = field(default_factory=TraceParameters)
     seed: int = 20_260

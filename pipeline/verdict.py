@@ -49,6 +49,27 @@ class VerdictParameters:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Steady:
+    """What all scenes of a drive together say of a small steady drift (``scene_sum``).
+
+    Attributes:
+        alarming: They say 'moved', at the run length that is wanted.
+        suspicious: They want more evidence.
+        drift: float64 (6,), rad and m, since then.
+        sigma: float64 (6,), of it, the floor between scenes included.
+        scenes: Scenes heard.
+        onset: When it began.
+    """
+
+    alarming: bool
+    suspicious: bool
+    drift: Floats
+    sigma: Floats
+    scenes: int
+    onset: Onset
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Memory:
     """What the machine knows between judgements.
 
@@ -143,6 +164,7 @@ def advance(
     required: tuple[str, ...],
     limits: Floats,
     parameters: VerdictParameters,
+    steady: Steady | None = None,
 ) -> Memory:
     """The state after one more judgement.
 
@@ -153,28 +175,58 @@ def advance(
         required: Axes that must be monitored for 'healthy'.
         limits: float64 (6,), alert limits.
         parameters: Hysteresis and patience.
+        steady: What all scenes of the drive together say, or None before the first.
     """
     now_ns = window_ns[1]
     memory = _remembered(memory, judgement, window_ns, required, parameters)
     if memory.severity is not None:
         # Latched: only a new extrinsic or an acknowledgement ends a drift, whatever is seen later.
         if judgement.alarming:
-            worse = _worse(memory.severity, _severity(judgement, limits))
+            worse = _worse(memory.severity, _severity(judgement.drift, limits))
             memory = dataclasses.replace(memory, severity=worse)
         if memory.state == "drifted":
             return memory
         return _enter(memory, "drift_confirmed", "The drift told before the fault stands.", now_ns)
+    told = _confirmed(memory, judgement, steady, limits, parameters)
+    if told is not None:
+        return told
+    code, reason = _suspicion(judgement, steady, limits)
+    if reason:
+        return _enter(memory, code, reason, now_ns)
+    return _quiet(memory, judgement, now_ns, required, parameters)
+
+
+def _confirmed(
+    memory: Memory,
+    judgement: Judgement,
+    steady: Steady | None,
+    limits: Floats,
+    parameters: VerdictParameters,
+) -> Memory | None:
+    """The memory with a drift that is sure, by windows in a row or by all scenes; None where none is."""
     if memory.alarms >= parameters.confirmations:
         onset = Onset(memory.quiet_ns, memory.quiet_from_ns, memory.stirred_ns)
-        memory = dataclasses.replace(memory, onset=onset, severity=_severity(judgement, limits))
-        return _enter(memory, "drift_confirmed", _drift_reason(judgement, limits), now_ns)
+        drift, reason = judgement.drift, _drift_reason(judgement, limits)
+    elif steady is not None and steady.alarming:
+        # A sum over scenes is persistent by itself: none of them alone is heard for enough to alarm.
+        onset, drift, reason = steady.onset, steady.drift, _steady_reason("has moved", steady, limits)
+    else:
+        return None
+    memory = dataclasses.replace(memory, onset=onset, severity=_severity(drift, limits))
+    return _enter(memory, "drift_confirmed", reason, memory.input_ns)
+
+
+def _suspicion(judgement: Judgement, steady: Steady | None, limits: Floats) -> tuple[str, str]:
+    """Code and reason of what wants more evidence; no reason where nothing does."""
     if judgement.contradicted:
         reason = "Lines and edges contradict each other beyond their errors: nothing is claimed of the mount."
-        return _enter(memory, "witnesses_disagree", reason, now_ns)
+        return "witnesses_disagree", reason
     if judgement.suspicious or judgement.alarming:
-        reason = f"Evidence of drift is not yet sure: {_size(judgement, _worst(judgement, limits))}."
-        return _enter(memory, "evidence_of_drift", reason, now_ns)
-    return _quiet(memory, judgement, now_ns, required, parameters)
+        size = _size(judgement, _worst(judgement, limits))
+        return "evidence_of_drift", f"Evidence of drift is not yet sure: {size}."
+    if steady is not None and steady.suspicious:
+        return "evidence_of_drift", _steady_reason("may have moved", steady, limits)
+    return "evidence_of_drift", ""
 
 
 def _quiet(
@@ -284,8 +336,8 @@ def _enter(memory: Memory, code: str, reason: str, now_ns: int) -> Memory:
     return dataclasses.replace(memory, state=state, code=code, reason=reason, since_ns=since)
 
 
-def _severity(judgement: Judgement, limits: Floats) -> Literal["minor", "major"]:
-    return "major" if bool(np.any(np.abs(judgement.drift) > limits)) else "minor"
+def _severity(drift: Floats, limits: Floats) -> Literal["minor", "major"]:
+    return "major" if bool(np.any(np.abs(drift) > limits)) else "minor"
 
 
 def _worse(a: Literal["minor", "major"], b: Literal["minor", "major"]) -> Literal["minor", "major"]:
@@ -297,7 +349,10 @@ def _worst(judgement: Judgement, limits: Floats) -> int:
 
 
 def _size(judgement: Judgement, axis: int) -> str:
-    value, sigma = float(judgement.drift[axis]), float(judgement.sigma[axis])
+    return _size_of(axis, float(judgement.drift[axis]), float(judgement.sigma[axis]))
+
+
+def _size_of(axis: int, value: float, sigma: float) -> str:
     if axis < 3:
         return f"{AXES[axis]} {np.degrees(value):+.2f} deg (sigma {np.degrees(sigma):.2f})"
     return f"{AXES[axis]} {value:+.3f} m (sigma {sigma:.3f})"
@@ -305,6 +360,12 @@ def _size(judgement: Judgement, axis: int) -> str:
 
 def _drift_reason(judgement: Judgement, limits: Floats) -> str:
     return f"The mount has moved: {_size(judgement, _worst(judgement, limits))}."
+
+
+def _steady_reason(claim: str, steady: Steady, limits: Floats) -> str:
+    axis = int(np.argmax(np.abs(steady.drift) / limits))
+    size = _size_of(axis, float(steady.drift[axis]), float(steady.sigma[axis]))
+    return f"Over {steady.scenes} scenes the mount {claim}: {size}."
 
 
 def _unmonitored_reason(judgement: Judgement, axes: list[int]) -> str:

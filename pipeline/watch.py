@@ -4,7 +4,7 @@ Pure: no files, no clock. What a stage costs is measured by the caller through `
 """
 
 import dataclasses
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -12,21 +12,23 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pipeline import line_witness, verdict, window
+from pipeline import edge_witness, line_witness, scene_sum, verdict, window
 from pipeline.belief import Belief, believe
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
 from pipeline.edge_witness import EdgeFrame
-from pipeline.edges import RING_JUMP, find_edges
-from pipeline.ego import Ego
-from pipeline.gradients import gradient_pyramid
+from pipeline.edges import RING_JUMP, Edges, find_edges
+from pipeline.ego import Ego, Straightened
+from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
 from pipeline.line_witness import LineFrame
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.mount import Mount
+from pipeline.onset import Onset
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, FramePair, Masks, PointCloud
 from pipeline.rings import sensor_origin
+from pipeline.scene_filter import Scene
 from pipeline.segmentation import Segmenter, grid_scale
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
@@ -48,6 +50,10 @@ def _unmeasured(name: str) -> AbstractContextManager[None]:
 
 _LEAST_EDGES = 20
 """Edges below which a frame says nothing: three per axis."""
+
+
+_SCENE_STAMPS = 1024
+"""Scenes whose stamps are kept: 20 km; a drift that began before is told to have begun before the data."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,15 +99,25 @@ class Watch:
         self._edge_frames: deque[EdgeFrame] = deque()
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
         self._dating = Dating(mount.camera, parameters.traces)
+        self.scenes = scene_sum.begin(mount.expectation(parameters.test))
+        self._scene_stamps: deque[int] = deque(maxlen=_SCENE_STAMPS)
+        self._begun_m: float | None = None
         self._begun_ns = 0
         self._judged_ns: int | None = None
-        self._lines_ns: int | None = None
+        self._lines_at: tuple[int, float] | None = None
+        self.departed: Counter[window.Departure] = Counter()
         self._count = 0
 
     @property
     def window_stamps(self) -> tuple[int, ...]:
         """Stamps of the frames in the window, ns."""
         return tuple(frame.stamp_ns for frame in self._edge_frames)
+
+    @property
+    def window_way_m(self) -> tuple[float, float]:
+        """Way driven at the oldest and newest frame with edges in the window, m; (0, 0) without any."""
+        frames = self._edge_frames
+        return (frames[0].distance_m, frames[-1].distance_m) if frames else (0.0, 0.0)
 
     @property
     def line_stamps(self) -> tuple[int, ...]:
@@ -175,7 +191,7 @@ class Watch:
         self._line_frames.clear()
         self._ego.forget()
         self._judged_ns = None
-        self._lines_ns = None
+        self._lines_at = None
 
     def _evidence_of(self, pair: FramePair, stage: Stage) -> Findings:
         """Edges of the frame, and lines when they are due."""
@@ -198,16 +214,14 @@ class Watch:
             edges = find_edges(
                 pair.cloud, ground, mount.camera, mount.T_cam_lidar, self.parameters.edges, self._origin
             )
-        masks, lines = self._lines_of(pair, ground, rng, stage)
+        masks, lines = None, None
+        if self._lines_due(now_ns=pair.image_stamp_ns, straight=straight):
+            masks, lines = self._lines_of(pair, ground, rng, stage)
         enough = edges is not None and len(edges) >= _LEAST_EDGES
         if edges is not None and enough:
             with stage("gradients"):
                 gradients = gradient_pyramid(pair.image, mount.camera)
-            self._edge_frames.append(
-                EdgeFrame(
-                    pair.image_stamp_ns, edges, gradients, straight.distance_m, self.mount.feigned(straight)
-                )
-            )
+            self._edge_frames.append(self._informed(pair, edges, gradients, straight))
             self._dating.see(self._edge_frames[-1])
         found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
         dropped: DropReason | None = None
@@ -217,16 +231,34 @@ class Watch:
         points = nothing if edges is None else edges.position[edges.kind == RING_JUMP].astype(np.float32)
         return Findings(dropped, pair.cloud, points, masks, lines, judged=False)
 
+    def _informed(
+        self, pair: FramePair, edges: Edges, gradients: GradientPyramid, straight: Straightened
+    ) -> EdgeFrame:
+        """The frame as the window keeps it."""
+        mount = self.mount
+        frame = EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m, mount.feigned(straight))
+        information = edge_witness.information_of(frame, mount.camera, mount.T_cam_lidar)
+        return dataclasses.replace(frame, information=information)
+
+    def _lines_due(self, now_ns: int, straight: Straightened) -> bool:
+        """Whether the frame gets masks and lines; it is then the last that got them."""
+        waited_ns, way_m = None, None
+        if self._lines_at is not None:
+            waited_ns = now_ns - self._lines_at[0]
+            way_m = None if straight.twist is None else straight.distance_m - self._lines_at[1]
+        every_ns = self.parameters.lines_every_ns
+        due = window.lines_due(waited_ns, way_m, every_ns, self.parameters.window)
+        if self._segmenter is None or not due:
+            return False
+        self._lines_at = (now_ns, straight.distance_m)
+        return True
+
     def _lines_of(
         self, pair: FramePair, ground: Ground | None, rng: np.random.Generator, stage: Stage
-    ) -> tuple[Masks | None, LineFrame | None]:
-        """Masks and lines of the frame, if it is time for them."""
-        now_ns, wait_ns = pair.image_stamp_ns, self.parameters.lines_every_ns
-        due = self._lines_ns is None or now_ns - self._lines_ns >= wait_ns - wait_ns // 10
-        if self._segmenter is None or not due:
-            return None, None
-        mount = self.mount
-        self._lines_ns = now_ns
+    ) -> tuple[Masks, LineFrame]:
+        """Masks and lines of the frame."""
+        assert self._segmenter is not None  # noqa: S101 - lines are due with a network only
+        mount, now_ns = self.mount, pair.image_stamp_ns
         with stage("network"):
             probabilities = self._segmenter.probabilities(pair.image.pixels)
         with stage("masks"):
@@ -259,7 +291,9 @@ class Watch:
         """Drops what is too old or too dense from the window."""
         settings = self.parameters.window
         if self._edge_frames:
-            kept = window.retained(list(self.window_stamps), settings)
+            frames = [window.Candidate(f.stamp_ns, f.distance_m, f.information) for f in self._edge_frames]
+            kept, left = window.retained(frames, settings)
+            self.departed.update(left)
             self._edge_frames = deque(self._edge_frames[index] for index in kept)
         while self._line_frames and self._line_frames[-1][0] - self._line_frames[0][0] > settings.longest_ns:
             self._line_frames.popleft()
@@ -284,6 +318,7 @@ class Watch:
         self._judged_ns = now_ns
         if self.belief is None:
             return findings
+        self._sum_scene(self.belief, now_ns)
         self.memory = verdict.advance(
             self.memory,
             self.belief.judgement,
@@ -291,12 +326,44 @@ class Watch:
             self.mount.required,
             self.mount.limits,
             self.parameters.verdict,
+            self._steady(),
         )
         self.memory = self._dating.dated(
             self.memory, self.mount, self._expectation(), self.belief, self._shown_since()
         )
         return Findings(
             None, findings.cloud, findings.edge_points, findings.masks, findings.lines, judged=True
+        )
+
+    def _sum_scene(self, belief: Belief, now_ns: int) -> None:
+        """Adds the window to the sum over scenes, once it shares no frame with the last that was added."""
+        oldest_m, newest_m = self.window_way_m
+        if self._begun_m is None:
+            self._begun_m = oldest_m
+        seen = belief.edges is not None and not belief.judgement.blind and not belief.judgement.contradicted
+        whole = newest_m - self._begun_m >= scene_sum.NEW_SCENE_M
+        if not (seen and whole and scene_sum.is_new(self.scenes, oldest_m, newest_m)):
+            return
+        evidence = belief.evidence
+        scene = Scene(evidence.drift, evidence.covariance, evidence.feigned, newest_m, now_ns)
+        expectation = self.mount.expectation(self.parameters.test)
+        self.scenes = scene_sum.advance(self.scenes, scene, expectation, self.parameters.scenes)
+        self._scene_stamps.append(now_ns)
+
+    def _steady(self) -> verdict.Steady | None:
+        """What all scenes so far say."""
+        total, settings = self.scenes, self.parameters.scenes
+        since_ns = total.since_ns
+        if since_ns is None:
+            return None
+        before_ns = max((stamp for stamp in self._scene_stamps if stamp < since_ns), default=self._begun_ns)
+        return verdict.Steady(
+            alarming=scene_sum.alarming(total, settings),
+            suspicious=scene_sum.suspicious(total, settings),
+            drift=total.moved,
+            sigma=np.sqrt(np.diag(total.moved_covariance)),
+            scenes=total.scenes,
+            onset=Onset(since_ns, before_ns, since_ns),
         )
 
     def _shown_since(self) -> int:
@@ -312,4 +379,4 @@ class Watch:
         edges = None if self.belief is None or self._judged_ns is None else self.belief.edges
         trail = None if edges is None else edges.trail
         frames = tuple(self._edge_frames)
-        return believe(self.mount, self.parameters, frames, lines, trail=trail)
+        return believe(self.mount, self.parameters, frames, lines, self.scenes.scenes, trail)

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.drift_test import DriftTestParameters, Evidence, expectation_of_stored, judge
+from pipeline.drift_test import DriftTestParameters, Evidence, at_chance, expectation_of_stored, judge
+from pipeline.run_length import AlarmBudget
 
 P = DriftTestParameters()
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.20, 0.15, 0.15])
@@ -35,9 +36,26 @@ def unit(axis, size):
 def test_thresholds_are_the_quantiles_they_claim():
     assert P.alarm == pytest.approx(stats.chi2.isf(1e-4, 6), abs=0.01)
     assert P.suspicion == pytest.approx(stats.chi2.isf(1e-3, 6), abs=0.01)
-    assert stats.ncx2.sf(P.alarm, 6, P.noncentrality) == pytest.approx(0.99, abs=2e-4)
     assert P.K_fa == pytest.approx(stats.norm.isf(0.5e-5), abs=1e-3)
     assert P.K_md == pytest.approx(stats.norm.isf(1e-3), abs=1e-3)
+
+
+def test_a_window_may_alarm_the_more_rarely_the_more_scenes_lie_behind():
+    budget = AlarmBudget()
+    first, second = (at_chance(P, budget, scene) for scene in (1, 2))
+    assert (first.alarm, first.suspicion) == pytest.approx((P.alarm, P.suspicion), abs=0.01)
+    assert stats.chi2.sf(second.alarm, 6) == pytest.approx(0.25e-4)
+    settled = at_chance(P, budget, 10**6)
+    assert stats.chi2.sf(settled.alarm, 6) * budget.yearly_scenes == pytest.approx(budget.yearly_alarms)
+    assert first.suspicion < first.alarm < second.alarm < settled.alarm
+
+
+@pytest.mark.parametrize("alarm", [P.alarm, 40.0])
+def test_what_is_detectable_is_noticed_in_99_of_100_windows(alarm):
+    judgement = judged(unit(2, 0.01), parameters=dataclasses.replace(P, alarm=alarm))
+    inverse = np.linalg.inv(SURE + P.floor() + C_REF)
+    noncentrality = judgement.detectable**2 * np.diag(inverse)
+    np.testing.assert_allclose(stats.ncx2.sf(alarm, 6, noncentrality), 0.99, atol=2e-4)
 
 
 def test_floor_knows_the_bearing_and_not_the_split():

@@ -10,7 +10,7 @@ from pipeline import verdict
 from pipeline.drift_test import Judgement
 from pipeline.onset import Onset
 from pipeline.records import AXES
-from pipeline.verdict import CODES, State, VerdictParameters, acknowledge, advance, start
+from pipeline.verdict import CODES, State, Steady, VerdictParameters, acknowledge, advance, start
 
 S = 1_000_000_000
 P = VerdictParameters()
@@ -53,6 +53,25 @@ def after(memory, judged, now_ns, window_ns=3 * S, required=REQUIRED):
     """The memory after one more pair and its judgement."""
     memory = verdict.paired(memory, now_ns)
     return advance(memory, judged, (now_ns - window_ns, now_ns), required, LIMITS, P)
+
+
+def steady(yaw_deg, *, alarming=False, suspicious=True):
+    drift = math.radians(yaw_deg) * np.eye(6)[2]
+    return Steady(alarming, suspicious, drift, np.full(6, 1e-3), 12, Onset(5 * S, 4 * S, 6 * S))
+
+
+def test_all_scenes_together_tell_what_no_window_does():
+    memory = verdict.paired(walked(QUIET, QUIET), 3 * S)
+    window_ns = 2 * S, 3 * S
+    doubted = advance(memory, QUIET, window_ns, REQUIRED, LIMITS, P, steady(0.2))
+    assert (doubted.state, doubted.code) == ("suspect", "evidence_of_drift")
+    assert doubted.reason == "Over 12 scenes the mount may have moved: yaw +0.20 deg (sigma 0.06)."
+    told = advance(memory, QUIET, window_ns, REQUIRED, LIMITS, P, steady(0.2, alarming=True))
+    assert (told.state, told.severity, told.onset) == ("drifted", "minor", Onset(5 * S, 4 * S, 6 * S))
+    major = advance(memory, QUIET, window_ns, REQUIRED, LIMITS, P, steady(0.6, alarming=True))
+    assert major.severity == "major"
+    calm = advance(memory, QUIET, window_ns, REQUIRED, LIMITS, P, steady(0.2, suspicious=False))
+    assert calm.state == "healthy"
 
 
 def walked(*judgements, begin=0, memory=None):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from monitor.clock import Clock
+from monitor.drift_baselines import OtherDrives
 from monitor.drift_drives import KnownDrive, Place
 from monitor.drift_rows import Row, Rows, Said, Six, SixFlags
 from monitor.statements import TO_PEOPLE
@@ -36,12 +37,15 @@ class Options:
         seed: Of whatever is drawn.
         kinds: Of trials.
         limits: float64 (6,), alert limits of every mount, rad and m, or None: each mount's own.
+        baselines: Learned on the other drives, or None: there are none.
+        parameters: Of the watch.
     """
 
     runs: int = RUNS
     seed: int = 0
     kinds: tuple[Kind, ...] = KINDS
     limits: Floats | None = None
+    baselines: OtherDrives | None = None
     parameters: Parameters = field(default_factory=Parameters)
 
 
@@ -64,7 +68,8 @@ def evaluate(
         progress: Told each run.
     """
     for place in places:
-        for drive in place.read():
+        for known in place.read():
+            drive = _stored(known, place.name, options)
             wanted = [
                 (kind, n) for kind in options.kinds for n in range(drift_trials.count(kind, options.runs))
             ]
@@ -74,17 +79,24 @@ def evaluate(
                 progress(drive.name, done, len(wanted))
 
 
+def _stored(drive: KnownDrive, place: str, options: Options) -> KnownDrive:
+    """The drive with the alert limits and the baseline that it is judged with."""
+    mount = drive.mount
+    if options.limits is not None:
+        mount = dataclasses.replace(mount, limits=options.limits)
+    if options.baselines is not None:
+        mount = dataclasses.replace(mount, baseline=options.baselines.baseline(place, drive))
+    return dataclasses.replace(drive, mount=mount)
+
+
 def run(
     drive: KnownDrive, kind: Kind, number: int, segmenter: Segmenter, options: Options, clock: Clock
 ) -> Row:
     """One run: the watch of ``replay``, without its outputs."""
-    mount = drive.mount
-    if options.limits is not None:
-        mount = dataclasses.replace(mount, limits=options.limits)
     # By name, so that a run is the same whichever drives are evaluated beside it.
     rng = np.random.default_rng([options.seed, zlib.crc32(drive.name.encode()), KINDS.index(kind), number])
-    trial = drift_trials.draw(kind, number, mount, rng)
-    staged = drift_trials.stage(trial, mount, drive.frames, rng)
+    trial = drift_trials.draw(kind, number, drive.mount, rng)
+    staged = drift_trials.stage(trial, drive.mount, drive.frames, rng)
     begun_ns = clock.monotonic_ns()
     watch = Watch(staged.mount, options.parameters, segmenter)
     states: list[tuple[State, float]] = []

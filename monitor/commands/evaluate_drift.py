@@ -66,6 +66,13 @@ _KINDS = (
     show_default=True,
     help="How well the recordings know their own extrinsic, per axis.",
 )
+@click.option(
+    "--baseline",
+    type=click.Choice(["none", "other"]),
+    default="none",
+    show_default=True,
+    help="Judge each recording with the baseline that the other recordings of its extrinsic give.",
+)
 @commands.model_option
 @commands.output_options
 def command(
@@ -76,6 +83,7 @@ def command(
     kinds: str,
     limits: tuple[float, float] | None,
     reference_sigma: tuple[float, float],
+    baseline: str,
     seed: int,
     model: Path | None,
     as_json: bool,
@@ -93,13 +101,17 @@ def command(
     from monitor import drift_drives, drift_plots, drift_tables  # noqa: PLC0415 - likewise
     from monitor.clock import SystemClock  # noqa: PLC0415 - likewise
     from monitor.daemon import software  # noqa: PLC0415 - likewise
+    from monitor.drift_baselines import OtherDrives  # noqa: PLC0415 - likewise
     from monitor.drift_evaluation import Options, evaluate  # noqa: PLC0415 - likewise
     from monitor.drift_rows import Header, Rows  # noqa: PLC0415 - likewise
     from monitor.drift_summary import summary_of  # noqa: PLC0415 - likewise
     from monitor.model_file import open_segmenter  # noqa: PLC0415 - likewise
+    from pipeline.parameters import Parameters  # noqa: PLC0415 - likewise
 
     if not places and not simulated:
         raise click.UsageError("nothing to watch: name a recording, or simulate some drives (--simulated N)")
+    if baseline == "other" and simulated:
+        raise click.UsageError("simulated drives are of one rig each: there is no other to learn from")
     chosen = _kinds_of(kinds)
     sigma, on_all = (
         None if known is None else np.array([np.radians(known[0])] * 3 + [known[1]] * 3)
@@ -112,13 +124,17 @@ def command(
     header = Header(
         seed=seed,
         limits=limits,
-        baseline=False,
+        baseline=baseline == "other",
         reference_sigma=reference_sigma,
         software=software(),
         network=segmenter.info.hash,
     )
     rows = Rows(folder, header)
-    evaluate(drives, segmenter, Options(runs, seed, chosen, on_all), rows, SystemClock(), commands.progress)
+    others = None
+    if baseline == "other":
+        others = OtherDrives(drives, segmenter, Parameters(), commands.progress)
+    options = Options(runs, seed, chosen, on_all, others)
+    evaluate(drives, segmenter, options, rows, SystemClock(), commands.progress)
     commands.clear()
     found = summary_of(header, rows.all)
     if folder is not None:

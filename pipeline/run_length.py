@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi, chi2, norm
+from scipy.special import ndtr
+from scipy.stats import chi, chi2
 
 _POINTS = 400
 """Parts of the integral over lengths; twice as many change the chance by less than 1e-4 of itself."""
@@ -76,7 +77,8 @@ def chance_per_scene(level: float, dimensions: int, longest: int) -> float:
 def _overshoot(x: np.ndarray) -> np.ndarray:
     """Siegmund's nu(x): by how much steps of size x that jump over a level make an alarm rarer."""
     half = 0.5 * x
-    return np.asarray((norm.cdf(half) - 0.5) / half / (half * norm.cdf(half) + norm.pdf(half)))
+    density = np.exp(-0.5 * half**2) / math.sqrt(2.0 * math.pi)
+    return np.asarray((ndtr(half) - 0.5) / half / (half * ndtr(half) + density))
 
 
 def level_for(chance: float, dimensions: int, longest: int) -> float:

@@ -50,7 +50,7 @@ ROADS = (
     Road("jam", 1.5, 0.5, 400.0, 1.5, 0.3, 400.0, 0.1),
     Road("empty", 18.0, 0.2, 2000.0, 3.0, 0.8, 300.0, 0.05),
 )
-"""A vehicle's week. Speeds and lengths are those of common roads; where less stands beside one, sigmas grow as
+"""A week of driving. Speeds and lengths are those of common roads; where less stands beside one, sigmas grow as
 between good and bad streets (PROBE 3 and 9: two to three times)."""
 
 _SYNC_S = 0.003

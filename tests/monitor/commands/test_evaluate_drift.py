@@ -1,17 +1,21 @@
 """``calibwatch evaluate drift`` from recordings to tables; what it says is what a watch says."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 from monitor.commands.evaluate_drift import _KINDS
+from monitor.drift_baselines import OtherDrives
 from monitor.drift_drives import drive_of, recorded, simulated
 from monitor.drift_evaluation import Options, run
 from monitor.drift_rows import FILE_NAME
 from monitor.model_file import open_segmenter
+from monitor.statements import TO_PEOPLE
 from pipeline import drift_trials, se3
 from pipeline.drift_trials import KINDS
+from pipeline.errors import InputError
 from pipeline.parameters import Parameters
 from pipeline.simulation.drive import START_NS
 from pipeline.watch import Watch
@@ -116,6 +120,7 @@ def test_simulated_drives_are_drawn_and_true(monkeypatch):
         ((), 2, "nothing to watch"),
         (("--simulated", 1, "--kinds", "helthy"), 2, "'helthy' is none of healthy"),
         (("--simulated", 1, "--limits", 0, 1), 2, "--limits"),
+        (("--simulated", 2, "--baseline", "other"), 2, "no other to learn from"),
         (("absent.mcap",), 1, "absent.mcap"),
     ],
 )
@@ -123,3 +128,24 @@ def test_bad_usage_is_one_line(calibwatch, arguments, code, what):
     got, _, err = calibwatch("evaluate", "drift", *arguments)
     assert got == code
     assert what in err
+
+
+def test_a_drive_is_judged_with_what_the_others_taught(cut, segmenter):
+    places = recorded([str(cut(7)), str(cut(9))], np.zeros(6))
+    taught = OtherDrives(places, segmenter, Parameters(), lambda *_: None)
+    (first,), (second,) = (place.read() for place in places)
+    for place, drive, other in ((places[0], first, second), (places[1], second, first)):
+        baseline = taught.baseline(place.name, drive)
+        assert {sample.recording for sample in baseline.stretches} == {other.name}
+    moved = dataclasses.replace(
+        first.mount, T_cam_lidar=se3.retract(first.mount.T_cam_lidar, np.full(6, 1e-3))
+    )
+    with pytest.raises(InputError, match="no other drive has the extrinsic of first7"):
+        taught.baseline(places[0].name, dataclasses.replace(first, mount=moved))
+    plain = run(first, "healthy", 0, segmenter, Options(), Clock())
+    mount = dataclasses.replace(first.mount, baseline=taught.baseline(places[0].name, first))
+    judged = run(dataclasses.replace(first, mount=mount), "healthy", 0, segmenter, Options(), Clock())
+    # The same frames; only what is expected of them differs.
+    assert judged.said.drift != pytest.approx(plain.said.drift, abs=1e-6)
+    shift = (np.array(plain.said.drift) - judged.said.drift) / TO_PEOPLE
+    assert shift == pytest.approx(mount.baseline.bias, abs=3e-3)

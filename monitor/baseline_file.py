@@ -59,7 +59,6 @@ class TailPart(_Part):
     stretches: NonNegativeInt
     needed: PositiveInt = Field(description="stretches at which the wanted run length is known")
     wanted_s: _Positive = Field(description="wanted run length between two false alarms, s")
-    largest: _NonNegative | None
     threshold: _Positive | None = Field(description="null: the default threshold stays")
     interval: tuple[FiniteFloat, FiniteFloat] | None = Field(description="95 % interval of the threshold")
 

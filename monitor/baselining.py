@@ -264,6 +264,8 @@ def described(learned: Learned) -> Description:
             f"alarm at T {tail.threshold:.1f} for one false alarm in a vehicle-year, extrapolated from "
             f"{tail.stretches} stretches (95 % interval {low:.1f} to {high:.1f})"
         )
+    elif recordings == 1:
+        threshold = "one recording tells no run length: default thresholds stay"
     elif tail.stretches < tail.needed:
         threshold = (
             f"too few for a run length ({tail.stretches} of some {tail.needed} stretches): "

@@ -25,7 +25,7 @@ from pipeline.road_samples import (
     scatter_of,
     stretches_of,
 )
-from pipeline.run_tail import Tail, tail_of
+from pipeline.run_tail import Tail, tail_of, unknown_tail
 
 PRIOR_SCENES = 8.0
 """Scenes that the floor for any rig was drawn from, two drives and six single frames (PROBE 3): it weighs as
@@ -146,12 +146,7 @@ def learn(
         deviation=np.asarray(deviation, dtype=np.float64),
         scatter=scatter,
         stretches=stretches,
-        tail=tail_of(
-            _largest_statistics(parts, stretches, scatter, parameters),
-            np.array([stretch.seconds for stretch in stretches]),
-            wanted_s,
-            rng,
-        ),
+        tail=_tail(parts, stretches, scatter, parameters, (wanted_s, rng)),
     )
 
 
@@ -238,20 +233,35 @@ def _joined(stretches: Sequence[RoadSample]) -> tuple[Floats, Floats]:
     return covariance @ np.einsum("nij,nj->i", information, means), covariance
 
 
+def _tail(
+    parts: Sequence[WindowEstimates],
+    stretches: Sequence[RoadSample],
+    scatter: Scatter,
+    parameters: DriftTestParameters,
+    wanted: tuple[float, np.random.Generator],
+) -> Tail:
+    """The tail over stretches, each against the baseline of other recordings.
+
+    Unknown where there is only one recording: against its own mean a drive looks better than it is.
+    """
+    wanted_s, rng = wanted
+    seconds = np.array([stretch.seconds for stretch in stretches])
+    unknown = unknown_tail(seconds, wanted_s)
+    if len(stretches) < unknown.needed or len({stretch.recording for stretch in stretches}) == 1:
+        return unknown
+    return tail_of(_largest_statistics(parts, stretches, scatter, parameters), seconds, wanted_s, rng)
+
+
 def _largest_statistics(
     parts: Sequence[WindowEstimates],
     stretches: Sequence[RoadSample],
     scatter: Scatter,
     parameters: DriftTestParameters,
 ) -> Floats:
-    """Per stretch the largest joint statistic of its windows against the baseline of other recordings.
-
-    Empty where there is only one recording: against its own mean a drive looks better than it is.
-    """
+    """Per stretch the largest joint statistic of its windows against the baseline of other recordings."""
     floor = parameters.floor()
     largest = np.zeros(0)
-    names = {stretch.recording for stretch in stretches}
-    for name in sorted(names) if len(names) > 1 else ():
+    for name in sorted({stretch.recording for stretch in stretches}):
         others = [stretch for stretch in stretches if stretch.recording != name]
         bias, covariance, spread = _fitted(others, floor)
         common = supported_floor(spread, floor, len(others)) + covariance

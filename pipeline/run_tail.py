@@ -5,6 +5,7 @@ continued as an exponential (as chi-square falls, in the end), with the interval
 stretches, which are the blocks that do not depend on each other (FORMULAS F4).
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -30,21 +31,29 @@ class Tail:
     """What healthy stretches say of a threshold.
 
     Attributes:
-        stretches: Stretches that were looked at.
+        stretches: Stretches that there are.
         needed: Stretches at which the wanted run length is known to a factor of ten.
         wanted_s: The wanted run length between two false alarms, s.
-        largest: Largest value seen, or None where nothing was seen.
-        threshold: Upper end of the interval of the extrapolated threshold, or None: too few stretches, or a
-            tail that falls more slowly than an exponential.
+        threshold: Upper end of the interval of the extrapolated threshold, or None: too few stretches, only
+            one recording, or a tail that falls more slowly than an exponential.
         interval: Its 95 % interval, or None.
     """
 
     stretches: int
     needed: int
     wanted_s: float
-    largest: float | None
     threshold: float | None
     interval: tuple[float, float] | None
+
+
+def unknown_tail(seconds: Floats, wanted_s: float) -> Tail:
+    """What is said of the tail before a value was looked at; arguments as of :func:`tail_of`."""
+    return Tail(len(seconds), stretches_needed(wanted_s / _block_s(seconds)), wanted_s, None, None)
+
+
+def _block_s(seconds: Floats) -> float:
+    # A lone window lasts no time; a stretch of road takes seconds.
+    return max(float(np.mean(seconds)), 1.0)
 
 
 def tail_of(values: Floats, seconds: Floats, wanted_s: float, rng: np.random.Generator) -> Tail:
@@ -52,20 +61,19 @@ def tail_of(values: Floats, seconds: Floats, wanted_s: float, rng: np.random.Gen
 
     Args:
         values: float64 (N,), the largest value of each stretch; in any order, it does not matter.
-        seconds: float64 (M,), durations of stretches, s: their mean is the time of one block.
+        seconds: float64 (N,), durations of the stretches, s: their mean is the time of one block.
         wanted_s: Wanted run length, s.
         rng: Draws the bootstrap samples.
     """
-    block_s = max(float(np.mean(seconds)), 1.0)
-    needed = stretches_needed(wanted_s / block_s)
-    largest = float(values.max()) if len(values) else None
-    if len(values) < needed or not _exponential(np.sort(values)):
-        return Tail(len(values), needed, wanted_s, largest, None, None)
+    block_s = _block_s(seconds)
+    unknown = unknown_tail(seconds, wanted_s)
     ordered = np.sort(values)
+    if len(values) < unknown.needed or not _exponential(ordered):
+        return unknown
     drawn = np.sort(rng.choice(ordered, (_RESAMPLES, len(ordered))), axis=1)
     thresholds = np.array([_extrapolated(sample, wanted_s / block_s) for sample in drawn])
     low, high = np.quantile(thresholds, [0.025, 0.975])
-    return Tail(len(values), needed, wanted_s, largest, float(high), (float(low), float(high)))
+    return dataclasses.replace(unknown, threshold=float(high), interval=(float(low), float(high)))
 
 
 def stretches_needed(blocks: float) -> int:

@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -109,7 +111,7 @@ def test_stretches_share_no_frame_and_are_long_enough(steps, span):
     end = np.cumsum(steps) + span
     parts = stretches_of(windows(end, span))
     assert parts
-    for before, after in zip(parts, parts[1:], strict=False):
+    for before, after in itertools.pairwise(parts):
         assert after.way_m[:, 0].min() >= before.way_m[:, 1].max() - 1e-6
     way = end[-1] - (end[0] - span)
     assert len(parts) <= max(1, way / STRETCH_M, 1)

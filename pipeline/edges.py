@@ -18,6 +18,7 @@ from pipeline.ground import Ground
 from pipeline.medians import median
 from pipeline.records import CameraModel, Floats, PointCloud, read_only
 from pipeline.rings import ScanPattern, scan_pattern, spin_turns
+from pipeline.strips import StripShape, strips_about
 
 RING_JUMP, BETWEEN_RINGS, PAINT = 0, 1, 2
 """Kinds of edges."""
@@ -167,7 +168,7 @@ def _about_z(
     pattern = scan_pattern(cloud, _in_view(cloud, camera, T_cam_lidar))
     if pattern is None:
         return None
-    xyz = cloud.xyz[pattern.index].astype(np.float64)
+    xyz = cloud.xyz.take(pattern.index, axis=0).astype(np.float64)
     azimuth = _true_azimuth(xyz)
     tangent = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(xyz))])
     found = [_ring_jumps(xyz, tangent, pattern, parameters)]
@@ -316,16 +317,19 @@ def _paint(
     reach = parameters.strip_widest_m + parameters.background_m
     first = np.maximum(starts[stretch[peak]], np.searchsorted(along, along[peak] - reach))
     last = np.minimum(ends[stretch[peak]], np.searchsorted(along, along[peak] + reach))
+    shape = StripShape(
+        least,
+        parameters.paint_asymmetry,
+        parameters.strip_narrowest_m,
+        parameters.strip_widest_m,
+        parameters.background_m,
+    )
     borders: list[float] = []
     last_end = -1
-    for p, a, b in zip(peak.tolist(), first.tolist(), last.tolist(), strict=True):
-        if p <= last_end:
-            continue
-        strip = _strip(along, intensity, p, a, b, least, parameters)
-        if strip is None:
-            continue
-        last_end = strip[1]
-        borders.extend(strip[2:])
+    for p, end, left, right in strips_about(along, intensity, (peak, first, last), shape):
+        if p > last_end:
+            last_end = int(end)
+            borders.extend((left, right))
     if not borders:
         return np.zeros((0, 3)), np.zeros((0, 3))
     place = np.array(borders)
@@ -333,59 +337,6 @@ def _paint(
     part = (place - whole)[:, None]
     nxt = np.minimum(whole + 1, len(xyz) - 1)
     return (1.0 - part) * xyz[whole] + part * xyz[nxt], tangent[whole]
-
-
-def _strip(
-    along: Floats, intensity: Floats, p: int, a: int, b: int, least: float, parameters: EdgeParameters
-) -> tuple[int, int, float, float] | None:
-    """The strip around a peak between indices a and b: ends of its half level, and its two borders.
-
-    The borders are fractional indices.
-    """
-    values, where = intensity[a:b], along[a:b] - along[p]
-    level = float(intensity[p])
-    outside = np.abs(where) > 0.5 * parameters.strip_widest_m
-    if not outside.any():
-        return None
-    # First guess of the road from beyond the widest strip, then the half level, then each side's own road.
-    half = 0.5 * (level + median(values[outside]))
-    below = values < half
-    k = p - a
-    left, right = below[:k].nonzero()[0], below[k + 1 :].nonzero()[0]
-    if left.size == 0 or right.size == 0:
-        return None
-    i, j = int(left[-1]), k + 1 + int(right[0])
-    begin, end = float(where[i + 1]), float(where[j - 1])
-    if not (j - i > 2 or end >= begin) or end - begin > parameters.strip_widest_m:
-        return None
-    left_road = values[(where < begin) & (where > begin - parameters.background_m)]
-    right_road = values[(where > end) & (where < end + parameters.background_m)]
-    if left_road.size < 2 or right_road.size < 2:
-        return None
-    low_left = float(np.add.reduce(left_road)) / left_road.size
-    low_right = float(np.add.reduce(right_road)) / right_road.size
-    rise = level - 0.5 * (low_left + low_right)
-    if rise < least or abs(low_left - low_right) > parameters.paint_asymmetry * rise:
-        return None
-    border_left = _crossing(values, i, i + 1, 0.5 * (level + low_left))
-    border_right = _crossing(values, j - 1, j, 0.5 * (level + low_right))
-    span = _between(where, border_right) - _between(where, border_left)
-    wide = span >= parameters.strip_narrowest_m
-    return (a + i, a + j, a + border_left, a + border_right) if wide else None
-
-
-def _between(values: Floats, place: float) -> float:
-    """The value at a fractional index inside the array."""
-    whole = int(place)
-    below, above = float(values[whole]), float(values[min(whole + 1, len(values) - 1)])
-    return below + (place - whole) * (above - below)
-
-
-def _crossing(values: Floats, i: int, j: int, level: float) -> float:
-    """Fractional index between neighbours i and j at which the values pass ``level``."""
-    low = float(values[i])
-    rise = float(values[j]) - low
-    return i + min(max((level - low) / rise, 0.0), 1.0) if rise != 0.0 else float(i)
 
 
 def _thinned(

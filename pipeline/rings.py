@@ -33,6 +33,9 @@ _RING_POINTS = 10
 _LEAST_STEP_RAD = 1e-6
 """Points nearer to each other on a ring are echoes of one beam, and no step."""
 
+_STEPS_ASKED = 15_000
+"""Points that tell the usual step and whether rings keep their elevation: some hundred a ring."""
+
 _STEP_NOISE_RAD = 1e-3
 """So far azimuth may run back along a ring: rounding of coordinates to millimetres at 1 m."""
 
@@ -127,21 +130,25 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
     chosen = np.flatnonzero(keep & (ring >= 0))
     if chosen.size < _FEWEST_RINGS:
         return None
-    xyz = cloud.xyz[chosen].astype(np.float64)
-    flat = np.hypot(xyz[:, 0], xyz[:, 1])
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    x, y, z = np.ascontiguousarray(cloud.xyz.take(chosen, axis=0).T, dtype=np.float64)
+    flat = np.hypot(x, y)
+    azimuth = np.arctan2(y, x)
     # The cut of the circle is laid where no point is: opposite to the middle of what is kept.
     middle = math.atan2(float(np.sin(azimuth).mean()), float(np.cos(azimuth).mean()))
     azimuth = np.mod(azimuth - middle + math.pi, 2.0 * math.pi)
-    elevation = np.arctan2(xyz[:, 2], flat)
-    rank = _rank_by_elevation(ring[chosen], elevation)
-    order = np.argsort(azimuth, kind="stable")
-    order = order[grouped(rank[order])]
-    spacing = np.diff(group_medians(elevation[order], rank[order], int(rank.max()) + 1))
-    # Where both echoes of a beam are one and the same, the second is no neighbour of the first.
-    again = (np.diff(rank[order]) == 0) & (np.diff(xyz[order], axis=0) == 0.0).all(axis=1)
-    order = order[np.concatenate([[True], ~again])]
+    elevation = np.arctan2(z, flat)
+    rank, medians = _rank_by_elevation(ring.take(chosen), elevation)
+    # Ring by ring first: a file goes on along a ring, and what is all but in order is sorted quickly.
+    order = grouped(rank)
+    order = order[np.argsort((4.0 * math.pi * rank + azimuth)[order], kind="stable")]
+    spacing = np.diff(medians)
     rank, azimuth = rank[order], azimuth[order]
+    # Where both echoes of a beam are one and the same, the second is no neighbour of the first.
+    twin = np.flatnonzero((np.diff(azimuth) == 0.0) & (np.diff(rank) == 0))
+    here, there = order[twin], order[twin + 1]
+    again = twin[(x[here] == x[there]) & (y[here] == y[there]) & (z[here] == z[there])] + 1
+    if again.size:
+        order, rank, azimuth = (np.delete(values, again) for values in (order, rank, azimuth))
     step = np.diff(azimuth)[np.diff(rank) == 0]
     step = step[step > _LEAST_STEP_RAD]
     if step.size == 0 or spacing.size == 0:
@@ -151,7 +158,7 @@ def scan_pattern(cloud: PointCloud, keep: NDArray[np.bool_]) -> ScanPattern | No
         ring=rank,
         azimuth=azimuth,
         elevation=elevation[order],
-        distance=np.hypot(flat, xyz[:, 2])[order],
+        distance=np.hypot(flat, z)[order],
         azimuth_step=median(step),
         ring_spacing=median(spacing),
     )
@@ -165,8 +172,9 @@ def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
         return None
     x, y, z = np.ascontiguousarray(cloud.xyz.T)
     azimuth = np.arctan2(y, x).astype(np.float64)
-    elevation = np.arctan2(z, np.hypot(x, y)).astype(np.float64)
-    distance = np.sqrt(x * x + y * y + z * z).astype(np.float64)
+    across = x * x + y * y
+    distance = np.sqrt(across + z * z)
+    elevation = np.arctan2(z, np.sqrt(across, out=across)).astype(np.float64)
     by_order = _rings_by_order(azimuth, elevation, distance)
     if by_order is not None and _believable(by_order, elevation):
         return by_order
@@ -176,50 +184,64 @@ def _rings(cloud: PointCloud) -> NDArray[np.int64] | None:
     return None
 
 
-def _rings_by_order(azimuth: Floats, elevation: Floats, distance: Floats) -> NDArray[np.int64] | None:
+def _rings_by_order(
+    azimuth: Floats, elevation: Floats, distance: NDArray[np.float32]
+) -> NDArray[np.int64] | None:
     """Ring number where the file holds ring after ring: each turn of the azimuth begins a new one."""
     step = _wrapped(np.diff(azimuth))
-    middle = median(step)
+    middle = median(step[:: max(1, len(step) // _STEPS_ASKED)])
     sense = math.copysign(1.0, middle)
     step *= sense
     # Ring after ring means small steps forward nearly always; column after column does not.
-    if float(np.mean((step > -_STEP_NOISE_RAD) & (step < math.radians(5.0)))) < 1.0 - _RING_STRAYS:
+    forward = np.count_nonzero((step > -_STEP_NOISE_RAD) & (step < math.radians(5.0)))
+    if forward < (1.0 - _RING_STRAYS) * len(step):
         return None
-    backward = step < -_CUT_RAD
+    cut = np.flatnonzero(np.abs(step) > _CUT_RAD)
     # In a sweep cut to a part of the turn the way over what was cut is still a way forward.
-    travelled = np.concatenate([[0.0], np.cumsum(np.where(backward, step + 2.0 * math.pi, step))])
-    count = travelled[-1] / (2.0 * math.pi)
+    step[cut] = np.mod(step[cut], 2.0 * math.pi)
+    turns = np.empty(len(azimuth))
+    turns[0] = 0.0
+    np.cumsum(step, out=turns[1:])
+    count = float(turns[-1]) / (2.0 * math.pi)
     if not _FEWEST_RINGS <= count <= _MOST_RINGS:
         return None
-    cut = np.abs(step) > _CUT_RAD
     turned = azimuth * sense
-    turned = np.where(turned < 0.0, turned + 2.0 * math.pi, turned)
-    seam = _seam(turned, elevation, distance, cut, count)
-    turns = (travelled + azimuth[0] * sense - seam) / (2.0 * math.pi)
-    ring = np.floor(turns).astype(np.int64)
+    turned[turned < 0.0] += 2.0 * math.pi
+    turns += azimuth[0] * sense - _seam(turned, elevation, distance, cut, count)
+    turns /= 2.0 * math.pi
+    whole = np.floor(turns)
+    ring = whole.astype(np.int64)
     ring -= ring[0]
     # Where a ring ends a point's ring is not sure, and no edge may be seen between it and the next.
-    unsure = np.abs(turns - np.rint(turns)) * 2.0 * math.pi < 2.0 * abs(middle)
-    return np.where(unsure, -1, ring)
+    turns -= whole
+    nearest = abs(middle) / math.pi
+    ring[(turns < nearest) | (turns > 1.0 - nearest)] = -1
+    return ring
 
 
 def _seam(
-    azimuth: Floats, elevation: Floats, distance: Floats, cut: NDArray[np.bool_], turns: float
+    azimuth: Floats,
+    elevation: Floats,
+    distance: NDArray[np.float32],
+    cut: NDArray[np.int64],
+    turns: float,
 ) -> float:
     """Azimuth in 0..2 pi at which one ring ends and the next begins: the elevation jumps there every turn.
 
     Inside a ring it jumps only where the range does (lasers sit some centimetres apart) and comes back, so
-    steps of range are left out, but for those over a ``cut`` (N-1,), and the rest is summed with its sign.
+    steps of range are left out, but for those over a ``cut`` (indices), and the rest is summed with its sign.
     """
     change = np.diff(elevation)
     spacing = float(np.ptp(elevation)) / turns
-    level = cut | (np.abs(np.diff(distance)) < _LEVEL_SHARE * distance[1:])
-    jumps = level & (np.abs(change) > 0.25 * spacing) & (np.abs(change) < 5.0 * spacing)
+    size = np.abs(change)
+    jumps = np.flatnonzero((size > 0.25 * spacing) & (size < 5.0 * spacing))
+    level = np.abs(distance[jumps + 1] - distance[jumps]) < _LEVEL_SHARE * distance[jumps + 1]
+    jumps = jumps[level | np.isin(jumps, cut)]
     sums, borders = np.histogram(
-        azimuth[1:][jumps], bins=_SEAM_BINS, range=(0.0, 2.0 * math.pi), weights=change[jumps]
+        azimuth[jumps + 1], bins=_SEAM_BINS, range=(0.0, 2.0 * math.pi), weights=change[jumps]
     )
     best = int(np.argmax(np.abs(sums + np.roll(sums, 1) + np.roll(sums, -1))))
-    offset = _wrapped(azimuth[1:][jumps] - borders[best])
+    offset = _wrapped(azimuth[jumps + 1] - borders[best])
     near = offset[np.abs(offset) < 2.0 * (borders[1] - borders[0])]
     seam = borders[best] + (median(near) if near.size else 0.0)
     return float(np.mod(seam - 0.5 * _empty_before(azimuth, best), 2.0 * math.pi))
@@ -235,8 +257,12 @@ def _empty_before(azimuth: Floats, seam_bin: int) -> float:
 
     In a sweep that was cut there, the first points of the rings lie along the cut and not at one azimuth.
     """
-    place = (azimuth * (_SEAM_BINS / (2.0 * math.pi))).astype(np.int64)
-    empty = np.bincount(np.minimum(place, _SEAM_BINS - 1), minlength=_SEAM_BINS) == 0
+    place = (azimuth * (_SEAM_BINS / (2.0 * math.pi))).astype(np.int16)
+    # A whole turn, to the last digit, belongs to the last bin.
+    empty = np.ones(_SEAM_BINS + 1, dtype=bool)
+    empty[place] = False
+    empty[_SEAM_BINS - 1] &= empty[_SEAM_BINS]
+    empty = empty[:_SEAM_BINS]
     before = np.roll(empty, _SEAM_BINS - seam_bin - 1)[::-1]
     # The cut may pass through the bin of the seam, or one beside it.
     first = int(np.argmax(before[:3]))
@@ -263,7 +289,8 @@ def _believable(ring: NDArray[np.int64], elevation: Floats) -> bool:
     Judged by the median point: lasers sit some centimetres apart, which bends a ring by degrees on near
     objects.
     """
-    sure = ring >= 0
+    sure = np.flatnonzero(ring >= 0)
+    sure = sure[:: max(1, len(sure) // _STEPS_ASKED)]
     ring, elevation = ring[sure], elevation[sure]
     order = grouped(ring)
     medians = group_medians(elevation[order], ring[order], int(ring.max()) + 1)
@@ -288,15 +315,19 @@ def _sharp(ring: NDArray[np.int64], elevation: Floats) -> bool:
     return off < _SHARP_SHARE * float(np.median(np.diff(medians[np.isfinite(medians)])))
 
 
-def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> NDArray[np.int64]:
-    """Ring numbers replaced by their rank from the lowest ring up, whatever the sensor's own order."""
+def _rank_by_elevation(ring: NDArray[np.int64], elevation: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Ring numbers replaced by their rank from the lowest ring up, whatever the sensor's own order.
+
+    With the median elevation of each rank, rad.
+    """
     order = grouped(ring)
     numbers = int(ring.max()) + 1
     # Numbers that are absent have no median; they are sorted to the end and name no point.
     medians = group_medians(elevation[order], ring[order], numbers)
     rank = np.empty(numbers, dtype=np.int64)
-    rank[np.argsort(medians)] = np.arange(numbers)
-    return rank[ring]
+    upwards = np.argsort(medians)
+    rank[upwards] = np.arange(numbers)
+    return rank[ring], medians[upwards[np.isfinite(medians[upwards])]]
 
 
 _ORIGIN_POINTS = 8000

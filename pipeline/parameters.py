@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from pipeline.causes import CauseParameters
 from pipeline.drift_test import DriftTestParameters
 from pipeline.edge_witness import EdgeWitnessParameters
 from pipeline.edges import EdgeParameters
@@ -25,6 +26,7 @@ class Parameters:
         window: Which frames stay, and when they are judged.
         test: Thresholds of the drift test.
         scenes: How all scenes of a drive are summed, and how often a false alarm may come.
+        causes: How a moved mount is told from clocks and lens.
         verdict: Hysteresis and patience.
         traces: How much of the past is kept to tell when a drift began.
         seed: Of the random numbers that RANSAC and the contrast draw.
@@ -37,6 +39,7 @@ class Parameters:
     window: WindowParameters = field(default_factory=WindowParameters)
     test: DriftTestParameters = field(default_factory=DriftTestParameters)
     scenes: SceneSumParameters = field(default_factory=SceneSumParameters)
+    causes: CauseParameters = field(default_factory=CauseParameters)
     verdict: VerdictParameters = field(default_factory=VerdictParameters)
     traces: TraceParameters = field(default_factory=TraceParameters)
     seed: int = 20_260

@@ -18,6 +18,10 @@ CODES = {
     "evidence_of_drift": "suspect",
     "within_stored_uncertainty": "suspect",
     "witnesses_disagree": "suspect",
+    "time_offset": "suspect",
+    "intrinsics_changed": "suspect",
+    "forward_or_sync": "suspect",
+    "cause_open": "suspect",
     "drift_confirmed": "drifted",
     "too_short": "unobservable",
     "axes_not_monitored": "unobservable",
@@ -67,6 +71,19 @@ class Steady:
     sigma: Floats
     scenes: int
     onset: Onset
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Why evidence is not held against the mount: clock or lens explain it as well, or better (``inquiry``).
+
+    Attributes:
+        code: Out of ``CODES``.
+        reason: One sentence.
+    """
+
+    code: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,6 +182,7 @@ def advance(
     limits: Floats,
     parameters: VerdictParameters,
     steady: Steady | None = None,
+    doubt: Doubt | None = None,
 ) -> Memory:
     """The state after one more judgement.
 
@@ -176,6 +194,7 @@ def advance(
         limits: float64 (6,), alert limits.
         parameters: Hysteresis and patience.
         steady: What all scenes of the drive together say, or None before the first.
+        doubt: What else than the mount may have changed, or None.
     """
     now_ns = window_ns[1]
     memory = _remembered(memory, judgement, window_ns, required, parameters)
@@ -187,6 +206,9 @@ def advance(
         if memory.state == "drifted":
             return memory
         return _enter(memory, "drift_confirmed", "The drift told before the fault stands.", now_ns)
+    if doubt is not None and not judgement.contradicted:
+        memory = dataclasses.replace(memory, alarms=0, alarm_drift=None)
+        return _enter(memory, doubt.code, doubt.reason, now_ns)
     told = _confirmed(memory, judgement, steady, limits, parameters)
     if told is not None:
         return told
@@ -259,10 +281,21 @@ def _quiet(
     return _enter(memory, "within_limits", f"Drift beyond the alert limits is excluded in {named}.", now_ns)
 
 
-def acknowledge(memory: Memory, now_ns: int) -> Memory:
-    """A person has taken note of a drift: the latch opens and evidence is collected anew."""
+def acknowledge(memory: Memory, now_ns: int, by: str, why: str) -> Memory:
+    """A person has taken note of a drift: the latch opens and evidence is collected anew.
+
+    Args:
+        memory: Before it.
+        now_ns: Stamp of the data.
+        by: Who, as they call themselves.
+        why: What they say of it.
+    """
     opened = dataclasses.replace(_anew(memory, now_ns), severity=None, onset=None)
-    return _enter(opened, "collecting", "The drift was acknowledged; evidence is being collected.", now_ns)
+    if memory.state in ("stale", "fault"):
+        # Inputs are not back, and nothing is mended, because a drift was noted.
+        return opened
+    reason = f"The drift was acknowledged by {by} ({why}); evidence is being collected."
+    return _enter(opened, "collecting", reason, now_ns)
 
 
 def finish(memory: Memory, judgement: Judgement | None, frames: int, required: tuple[str, ...]) -> Memory:

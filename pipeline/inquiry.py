@@ -1,0 +1,175 @@
+"""The inquiry into what moved: sections of a drive are kept, and asked when something stirs (FORMULAS G)."""
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline import se3
+from pipeline.belief import Belief
+from pipeline.causes import CauseParameters, Explanation, Section, explain
+from pipeline.edge_score import EdgeFrame
+from pipeline.ego import Straightened
+from pipeline.mount import Mount
+from pipeline.parameters import Parameters
+from pipeline.records import Floats
+from pipeline.sections import Move, Passage, Place, fresh, linearised
+from pipeline.verdict import Doubt, Memory
+
+_SECTIONS = 90
+"""Sections kept: two kilometres, some minutes; a cause that is older than they are stands in all of them."""
+
+_MOST_MOVES = 512
+"""Frames whose motion is remembered: more than any window holds."""
+
+
+class Inquiry:
+    """What one drive says of mount, clock and lens.
+
+    Args:
+        mount: What is stored of the pair.
+        parameters: Settings.
+    """
+
+    def __init__(self, mount: Mount, parameters: Parameters) -> None:
+        self.explanation: Explanation | None = None
+        self._mount = mount
+        self._parameters = parameters
+        # Moves without their frames: a frame weighs megabytes, and the window drops most of them.
+        self._moves: deque[Move] = deque(maxlen=_MOST_MOVES)
+        self._sections: deque[Section] = deque(maxlen=_SECTIONS)
+        self._window: Section | None = None
+        self._asked_ns: int | None = None
+
+    def see(self, stamp_ns: int, sweep: Straightened) -> None:
+        """Remembers how the vehicle moved while a frame was taken, the newest."""
+        if self._moves and stamp_ns < self._moves[-1].stamp_ns:
+            self.forget()
+        motion = self._mount.motion(sweep.twist)
+        self._moves.append(Move(stamp_ns, motion, sweep.twist is not None, sweep.sync_s))
+
+    def forget(self) -> None:
+        """The stream was interrupted, or a new extrinsic holds: what was seen before is of no use."""
+        self._moves.clear()
+        self._sections.clear()
+        self._window = self._asked_ns = self.explanation = None
+
+    def ask(
+        self, frames: Sequence[EdgeFrame], belief: Belief, memory: Memory, *, stirred: bool, claimed: bool
+    ) -> Doubt | None:
+        """What speaks against a moved mount after a judgement.
+
+        Args:
+            frames: The window's frames with edges, ascending in time.
+            belief: What was judged.
+            memory: Before the judgement.
+            stirred: Whether there is suspicion.
+            claimed: Whether the evidence is to be called a drift.
+
+        Returns:
+            Another cause, or that it is open; None where the mount may be blamed, or nothing is wrong.
+        """
+        moves = {move.stamp_ns: move for move in self._moves}
+        window = [Passage(frame, moves[frame.stamp_ns]) for frame in frames if frame.stamp_ns in moves]
+        if belief.edges is None or belief.judgement.blind or not window:
+            return None
+        self._close(window, belief.edges.xi)
+        if stirred and memory.severity is None:
+            self._look_closer(window, belief.edges.xi)
+        else:
+            self._window = self._asked_ns = None
+        self._explain(memory, stirred=stirred or memory.severity is not None)
+        return self._doubt(stirred=stirred, claimed=claimed)
+
+    def _close(self, window: Sequence[Passage], xi: Floats) -> None:
+        """Keeps the newest frames as a section of their own once they make one."""
+        last = self._sections[-1] if self._sections else None
+        settings = self._parameters.window
+        new = fresh(window, last, settings.least_frames, settings.dense_frames)
+        if new:
+            self._sections.append(linearised(new, xi, self._place(), self._parameters.edge_witness))
+
+    def _look_closer(self, window: Sequence[Passage], xi: Floats) -> None:
+        """Takes the whole window as a section: what stirs may be younger than any that is kept."""
+        now_ns, wait_ns = window[-1].frame.stamp_ns, self._parameters.window.judge_every_ns
+        if self._asked_ns is not None and now_ns - self._asked_ns < wait_ns:
+            return
+        self._asked_ns = now_ns
+        self._window = linearised(window, xi, self._place(), self._parameters.edge_witness)
+
+    def _explain(self, memory: Memory, *, stirred: bool) -> None:
+        sections = list(self._sections)
+        if stirred:
+            # Before the last quiet judgement nothing was wrong: what was seen then is of another mount.
+            since_ns = memory.quiet_ns
+            until_ns = self._window.from_ns if self._window is not None else None
+            sections = [
+                s for s in sections if s.from_ns > since_ns and (until_ns is None or s.to_ns < until_ns)
+            ]
+            sections += [] if self._window is None else [self._window]
+        if not sections:
+            self.explanation = None
+            return
+        expectation = self._mount.expectation(self._parameters.test)
+        doubt = expectation.covariance + expectation.floor
+        self.explanation = explain(sections, doubt, self._mount.limits, self._parameters.causes)
+
+    def _place(self) -> Place:
+        mount, expectation = self._mount, self._mount.expectation(self._parameters.test)
+        B = se3.vehicle_block(mount.R_vehicle_cam)
+        return Place(
+            camera=mount.camera,
+            T_expected=se3.retract(mount.T_cam_lidar, B.T @ expectation.mean),
+            R_vehicle_cam=mount.R_vehicle_cam,
+            floor=expectation.floor,
+            zoom=self._parameters.causes.zoom,
+        )
+
+    def _doubt(self, *, stirred: bool, claimed: bool) -> Doubt | None:
+        found, settings = self.explanation, self._parameters.causes
+        if found is None:
+            return None
+        if not stirred:
+            return self._unnoticed(found, settings)
+        cause = found.cause(settings)
+        if cause == "mount" or (cause == "cause_open" and not claimed):
+            return None
+        return Doubt(cause, _REASONS[cause].format(**_sizes(found)))
+
+    def _unnoticed(self, found: Explanation, settings: CauseParameters) -> Doubt | None:
+        """What surely changed and matters, though no window alone shows it."""
+        limits = self._mount.limits
+        late = abs(found.time_offset_s) * found.motion
+        if found.changed("clock", settings) and found.separable and bool(np.any(late > limits)):
+            return Doubt("time_offset", _REASONS["time_offset"].format(**_sizes(found)))
+        if found.changed("lens", settings) and abs(found.zoom) * self._border() > float(limits[1:3].min()):
+            return Doubt("intrinsics_changed", _REASONS["intrinsics_changed"].format(**_sizes(found)))
+        return None
+
+    def _border(self) -> float:
+        """Angle, rad, by which a ray at the left or right border turns per unit of log focal length."""
+        camera = self._mount.camera
+        f, centre = float(camera.K[0, 0]), float(camera.K[0, 2])
+        slope = max(centre, camera.width - 1 - centre) / f
+        return slope / (1.0 + slope**2)
+
+
+_REASONS = {
+    "time_offset": "Sweeps and images are {delay:+.0f} ms apart (sigma {delay_sigma:.0f}) beyond "
+    "their stamps: the mount need not have moved.",
+    "intrinsics_changed": "The focal length is {zoom:+.1f} % off the stored one (sigma {zoom_sigma:.1f}): "
+    "the mount need not have moved.",
+    "forward_or_sync": "A mount that has moved forward or back, or images {alone:+.0f} ms off in time: "
+    "the speeds driven so far do not tell which.",
+    "cause_open": "Mount, clock or lens has changed: the drive so far does not tell which.",
+}
+
+
+def _sizes(found: Explanation) -> dict[str, float]:
+    return {
+        "delay": 1e3 * found.time_offset_s,
+        "delay_sigma": 1e3 * found.time_sigma_s,
+        "alone": 1e3 * found.time_alone_s,
+        "zoom": 1e2 * found.zoom,
+        "zoom_sigma": 1e2 * found.zoom_sigma,
+    }

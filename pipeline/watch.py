@@ -160,13 +160,16 @@ class Watch:
             self.memory = self._dating.redated(self.memory, self.mount, self._expectation(), self.belief)
         self.memory = verdict.finish(self.memory, judgement, self._count, self.mount.required)
 
-    def acknowledge(self, now_ns: int) -> bool:
+    def acknowledge(self, now_ns: int, by: str, why: str) -> bool:
         """A person has taken note of the drift: evidence is collected anew; False where none is told."""
         if self.memory is None or self.memory.severity is None:
             return False
-        self.memory = verdict.acknowledge(self.memory, now_ns)
+        self.memory = verdict.acknowledge(self.memory, now_ns, by, why)
         self._forget()
         self._dating = Dating(self.mount.camera, self.parameters.traces)
+        self.scenes = scene_sum.begin(self._expectation())
+        self._scene_stamps.clear()
+        self._begun_m = None
         self._begun_ns = now_ns
         return True
 

@@ -224,8 +224,9 @@ def test_a_drift_from_the_beginning_has_its_onset_there():
 
 
 def test_acknowledged_drift_starts_anew():
-    memory = acknowledge(drifted(), 10 * S)
+    memory = acknowledge(drifted(), 10 * S, "Ada", "bracket tightened")
     assert told(memory) == ("starting", "collecting")
+    assert "Ada (bracket tightened)" in memory.reason
     assert (memory.severity, memory.onset, memory.since_ns) == (None, None, 10 * S)
     assert walked(QUIET, begin=10 * S, memory=memory).state == "healthy"
     again = walked(ALARM, ALARM, ALARM, begin=10 * S, memory=memory)
@@ -256,7 +257,10 @@ def test_a_drift_outlives_silence_with_its_onset():
     assert told(back) == ("drifted", "drift_confirmed")
     assert back.onset is stale.onset
     assert back.severity == "major"
-    assert acknowledge(stale, 60 * S).state == "starting"
+    # To note a drift brings no inputs back; when they come, nothing is left of it.
+    noted = acknowledge(stale, 60 * S, "Ada", "bracket tightened")
+    assert (noted.state, noted.severity, noted.onset) == ("stale", None, None)
+    assert told(paired(noted, 61 * S)) == ("starting", "collecting")
 
 
 def test_two_alarms_before_silence_and_one_after_are_not_three():

@@ -260,7 +260,7 @@ def test_a_drift_outlives_silence_with_its_onset():
     # To note a drift brings no inputs back; when they come, nothing is left of it.
     noted = acknowledge(stale, 60 * S, "Ada", "bracket tightened")
     assert (noted.state, noted.severity, noted.onset) == ("stale", None, None)
-    assert told(paired(noted, 61 * S)) == ("starting", "collecting")
+    assert told(verdict.paired(noted, 61 * S)) == ("starting", "collecting")
 
 
 def test_two_alarms_before_silence_and_one_after_are_not_three():

@@ -32,6 +32,7 @@ class EdgeFrame:
         distance_m: Way driven so far, m.
         feigned: float64 (6,), drift in vehicle axes that an error of one sigma in the time between sweep and
             image would feign (FORMULAS G1).
+        information: float64 (6,6), what the frame says by itself (:func:`edge_witness.information_of`).
     """
 
     stamp_ns: int
@@ -39,6 +40,7 @@ class EdgeFrame:
     gradients: GradientPyramid
     distance_m: float = 0.0
     feigned: Floats = field(default_factory=lambda: np.zeros(6))
+    information: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 NEW_SCENE_M = 20.0

@@ -33,7 +33,7 @@ from pipeline.edge_search import (
     find_maxima,
     start_curvature,
 )
-from pipeline.records import Floats
+from pipeline.records import CameraModel, Floats
 
 __all__ = [
     "NEW_SCENE_M",
@@ -47,6 +47,7 @@ __all__ = [
     "batch_of",
     "chance",
     "far_extrinsics",
+    "information_of",
     "score",
     "score_only",
     "solve",
@@ -295,6 +296,24 @@ def _covariance(batch: EdgeBatch, H: Floats, share: Floats, parameters: EdgeWitn
     # A direction that no cell pulls on has no stated error; the floor of H alone bounds it.
     C = C + 1e-8 * np.eye(6)
     return np.asarray(UNITS[:, None] * C * UNITS[None, :], dtype=np.float64)
+
+
+def information_of(frame: EdgeFrame, camera: CameraModel, T_cam_lidar: Floats) -> Floats:
+    """What a frame would say by itself, float64 (6,6), alert units: H G^-1 H by the gradients there.
+
+    Good for a choice between frames, not for an estimate: the curvature is guessed from the gradients.
+    """
+    batch = batch_of([frame], camera, _ENOUGH_EDGES)
+    value, _, share = score(batch, T_cam_lidar, 0)
+    H = start_curvature(share * UNITS, batch.weight, value)
+    cells = np.stack([np.bincount(batch.cell, weights=column) for column in (share * UNITS).T])
+    # What no cell pulls on is not known, rather than known exactly.
+    spread = cells @ cells.T + np.eye(6) * max(float(np.trace(cells @ cells.T)), 1e-12) * 1e-3
+    return np.asarray(H @ np.linalg.solve(spread, H), dtype=np.float64)
+
+
+_ENOUGH_EDGES = 600
+"""Edges that tell a frame's information as well as all of them (PROBE 8)."""
 
 
 _CHANCE_STRIDE = 3

@@ -74,6 +74,42 @@ def test_all_scenes_together_tell_what_no_window_does():
     assert calm.state == "healthy"
 
 
+OTHER_CAUSES = ("time_offset", "intrinsics_changed", "forward_or_sync", "cause_open")
+
+
+def doubted(memory, code, judged, sum_of_scenes=None):
+    """The memory a second later, with a doubt whether it is the mount that moved."""
+    now_ns = memory.input_ns + S
+    window_ns = now_ns - 3 * S, now_ns
+    doubt = verdict.Doubt(code, "Images come late.")
+    memory = verdict.paired(memory, now_ns)
+    return advance(memory, judged, window_ns, REQUIRED, LIMITS, P, sum_of_scenes, doubt)
+
+
+@pytest.mark.parametrize("code", OTHER_CAUSES)
+def test_no_drift_is_told_while_something_else_may_have_changed(code):
+    memory = walked(QUIET, ALARM, ALARM)
+    for _ in range(5):
+        memory = doubted(memory, code, ALARM, steady(0.6, alarming=True))
+        assert (memory.state, memory.code, memory.reason) == ("suspect", code, "Images come late.")
+    assert memory.alarms == 0
+    # Once the doubt is gone, alarms are counted from the start.
+    assert [walked(*[ALARM] * n, begin=8 * S, memory=memory).state for n in (1, 2, 3)] == [
+        "suspect",
+        "suspect",
+        "drifted",
+    ]
+
+
+def test_something_else_that_surely_changed_is_told_though_windows_are_quiet():
+    assert told(doubted(walked(QUIET), "time_offset", QUIET)) == ("suspect", "time_offset")
+
+
+def test_a_doubt_neither_opens_a_latch_nor_hides_a_contradiction():
+    assert told(doubted(drifted(), "time_offset", ALARM)) == ("drifted", "drift_confirmed")
+    assert told(doubted(walked(QUIET), "time_offset", CONTRADICTED)) == ("suspect", "witnesses_disagree")
+
+
 def walked(*judgements, begin=0, memory=None):
     """The memory after judgements a second apart, the first a second after ``begin``."""
     memory = start(begin) if memory is None else memory
@@ -153,6 +189,7 @@ def test_every_code_can_be_told():
         no_pairs,
         verdict.silent(walked(QUIET), 4 * S, P),
         verdict.faulted(walked(QUIET), "the disk is full", 4 * S),
+        *(doubted(walked(QUIET), code, ALARM) for code in OTHER_CAUSES),
     ]
     assert {memory.code for memory in memories} == set(CODES)
     for memory in memories:

@@ -191,10 +191,11 @@ def _refuse_unhealthy(mount: Mount, drives: Sequence[Drive], pair: str) -> None:
 
 
 def _refuse_twins(drives: Sequence[Drive], pair: str) -> None:
-    """InputError where two recordings hold the same drive."""
+    """InputError where two recordings hold the same drive, or a part of it: no two windows are ever equal."""
+    windows = [{row.tobytes() for row in drive.estimates.drift} for drive in drives]
     for index, drive in enumerate(drives):
-        for other in drives[:index]:
-            if np.array_equal(drive.estimates.drift, other.estimates.drift):
+        for before, other in enumerate(drives[:index]):
+            if windows[index] & windows[before]:
                 names = f"{other.estimates.recording} and {drive.estimates.recording}"
                 raise InputError(
                     f"pair {pair}: {names} are the same drive", hint="one drive is one sample: name it once"
@@ -275,10 +276,9 @@ def described(learned: Learned) -> Description:
         threshold = "the statistic has too heavy a tail to continue: default thresholds stay"
     values = (baseline.bias * TO_PEOPLE, sigma, scene, expected.bound * TO_PEOPLE)
     rows = tuple((float(b), float(s), float(q), float(limit)) for b, s, q, limit in zip(*values, strict=True))
-    everything = range(len(AXIS_NAMES))
     others = tuple(
         f"{other.recording} against the others: T {other.statistic:.1f}, "
-        f"{_sizes(other.difference, everything)}"
+        + ", ".join(_sizes(other.difference, [axis]) for axis in range(len(AXIS_NAMES)))
         for other in learned.others
     )
     return Description(samples, bias, threshold, rows, others)

@@ -4,6 +4,7 @@ Sessions meet only by the endpoints that they are told: no multicast, no gossip,
 nor tests find each other by accident. All keys of DESIGN 6 are built here, from names that were checked.
 """
 
+import ipaddress
 import json
 import os
 import re
@@ -84,6 +85,35 @@ def open_session(settings: BusSettings) -> zenoh.Session:
             hint = "is the port free, and the address one of this machine?"
             what = f"can not listen on {', '.join(settings.listen)}"
         raise TransportError(what, hint=hint) from error
+
+
+def command_refusal(settings: BusSettings, *, allowed: bool) -> str | None:
+    """Why nobody may command over a session of these settings; None where who reaches it may.
+
+    Who can reach a session that meets others on this machine alone, or that asks them for an identity, may;
+    a router passes on what it is told, so a session that connects to one is not closed to others.
+    """
+    endpoints = (*settings.connect, *settings.listen)
+    at_home = not settings.connect and all(_is_loopback(endpoint) for endpoint in settings.listen)
+    known = settings.tls is not None and all(endpoint.startswith(_IDENTIFIED) for endpoint in endpoints)
+    if allowed or at_home or known:
+        return None
+    return "commands are refused, for others may reach this bus: start the watch with --allow-commands"
+
+
+_IDENTIFIED = ("tls/", "quic/")
+"""Protocols at which both sides prove who they are."""
+
+
+def _is_loopback(endpoint: str) -> bool:
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream":
+        return True
+    host = re.split(r"[?#]", address)[0].rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def listening_at(session: zenoh.Session) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ import click
 from pipeline.errors import CalibwatchError
 
 COMMANDS = {
+    "acknowledge": "Take note of a drift that a running watch has told.",
     "baseline": "Learn a rig's own bias from healthy recordings, so that smaller drifts can be told.",
     "calibrate": "The extrinsic of a recording or a single frame, and how good it is.",
     "demo": "Simulate a drive in which the camera mount slips, and watch it being told.",

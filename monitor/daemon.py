@@ -3,7 +3,7 @@
 import hashlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 
 import numpy as np
@@ -15,6 +15,7 @@ from monitor.intake import Intake
 from monitor.messages import Message
 from monitor.outputs import Outputs
 from monitor.refusal import Account, drop_notes, refuse_unusable
+from monitor.requests import Requests
 from monitor.rig import Rig, RigPair
 from monitor.sources import Losses, Tick
 from monitor.statements import Identity
@@ -48,12 +49,14 @@ class Watching:
         engines: One per pair, by name.
         outputs: Tell the world.
         tell: Told at once, one sentence each, what people should know of the inputs and the outputs.
+        requests: What people ask of it meanwhile.
     """
 
     intake: Intake
     engines: dict[str, Engine]
     outputs: Outputs
     tell: Callable[[str], None]
+    requests: Requests = field(default_factory=Requests)
 
 
 def watching(
@@ -165,10 +168,24 @@ def _feed(
                 progress(pairs)
         for engine in engines.values():
             _tell(watching_, engine.tick(arrival_ns))
+        _heed(watching_)
         for note in intake.notes[told:]:
             watching_.tell(note)
         told = len(intake.notes)
     return arrival_ns
+
+
+def _heed(watching_: Watching) -> None:
+    """Does what people have asked for since the last message, in the thread that owns the engines."""
+    for request in watching_.requests.take():
+        note = request.note
+        events = watching_.engines[request.pair].acknowledge(note.by, note.reason)
+        if not events:
+            request.answer("no drift is told that could be acknowledged")
+            continue
+        _tell(watching_, events)
+        watching_.tell(f"{request.pair}: drift acknowledged by {note.by} ({note.reason})")
+        request.answer(None)
 
 
 def _tell(watching_: Watching, events: Sequence[Event]) -> None:

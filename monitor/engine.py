@@ -137,6 +137,10 @@ class Engine:
             text = f"Images are {width}x{height} px, the intrinsics are for {camera.width}x{camera.height}."
         self.watch.fault(text, self._now_ns)
 
+    def acknowledge(self, by: str, why: str) -> list[Event]:
+        """A person takes note of the drift: the status after it; nothing where no drift is told."""
+        return [self._status()] if self.watch.acknowledge(self._now_ns, by, why) else []
+
     def finish(self) -> list[Event]:
         """The input has ended: the last status."""
         self.watch.finish(self._now_ns)

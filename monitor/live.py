@@ -10,6 +10,7 @@ import zenoh
 from monitor import bus
 from monitor.baseline_file import with_baselines
 from monitor.clock import Clock
+from monitor.command_bus import CommandBus
 from monitor.daemon import watch, watching
 from monitor.discovery import Survey, survey_in
 from monitor.messages import Message
@@ -43,6 +44,7 @@ def run(
     stop: threading.Event,
     clock: Clock,
     ready: Callable[[], None] | None = None,
+    allow_commands: bool = False,
 ) -> State:
     """Watches a rig until ``stop`` is set; tells its status on the bus and, with ``out``, in files.
 
@@ -55,6 +57,7 @@ def run(
         stop: Ends the watch.
         clock: Of the machine.
         ready: Called once when all topics are listened to.
+        allow_commands: Whether whoever reaches the bus may command, also from other machines.
 
     Returns:
         The last state.
@@ -87,7 +90,12 @@ def run(
         outputs = open_outputs(("status_bus", *(FILES if out is not None else ())), surroundings)
         try:
             under_watch = watching(rig, segmenter, Parameters(), outputs, clock, _log.warning)
-            with ZenohLive(session, subscriptions(rig), now_ns=now_ns, stop=stop) as source:
+            pairs = tuple(under_watch.engines)
+            refusal = bus.command_refusal(settings, allowed=allow_commands)
+            with (
+                CommandBus(session, rig.vehicle, pairs, under_watch.requests, refusal),
+                ZenohLive(session, subscriptions(rig), now_ns=now_ns, stop=stop) as source,
+            ):
                 if ready is not None:
                     ready()
                 return watch(under_watch, source, source.losses, stop)

@@ -33,6 +33,11 @@ from monitor import commands
     show_default=True,
     help="Images kept in the recording per second and camera, some 0.5 MB each.",
 )
+@click.option(
+    "--allow-commands",
+    is_flag=True,
+    help="Let whoever reaches the bus acknowledge drifts; default: only whoever is on this machine.",
+)
 @commands.model_option
 def command(
     *,
@@ -41,6 +46,7 @@ def command(
     listen: tuple[str, ...],
     out: Path | None,
     images_hz: float,
+    allow_commands: bool,
     model: Path | None,
 ) -> int:
     """Watch live sensors on a zenoh bus until interrupted.
@@ -63,5 +69,6 @@ def command(
             stop=stop,
             clock=SystemClock(),
             ready=lambda: click.echo("watching", err=True),
+            allow_commands=allow_commands,
         )
     return 0

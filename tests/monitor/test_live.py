@@ -11,9 +11,11 @@ import zenoh.ext
 from monitor import live
 from monitor.bus import BusSettings, Origin, listening_at, open_session
 from monitor.clock import SystemClock
+from monitor.command_bus import acknowledge
 from monitor.preparation import prepare
+from monitor.requests import Note
 from monitor.rig import parse_inject
-from pipeline.errors import RigError
+from pipeline.errors import RigError, TransportError
 from tests import drives
 from tests.drives import CLOUD_TOPIC, IMAGE_TOPIC, INFO_TOPIC, TF_TOPIC
 
@@ -60,7 +62,7 @@ def daemon(hub):
     stop = threading.Event()
     threads = []
 
-    def start(rig_file, out=None):
+    def start(rig_file, out=None, *, allow_commands=False):
         ready, ended = threading.Event(), queue.Queue()
         settings = BusSettings(connect=listening_at(hub))
 
@@ -75,6 +77,7 @@ def daemon(hub):
                     stop=stop,
                     clock=SystemClock(),
                     ready=ready.set,
+                    allow_commands=allow_commands,
                 )
                 ended.put(state)
             except BaseException as error:  # noqa: BLE001 - handed to the test
@@ -127,7 +130,7 @@ def test_a_drift_is_told_on_the_bus_and_the_watch_ends_when_it_is_told_to(
 ):
     said, subscriber = statuses(hub)
     rig = rig_with(tmp_path / "rig.toml", cut(5), "yaw=1")
-    ready, stop, ended = daemon(rig, tmp_path / "out")
+    ready, stop, ended = daemon(rig, tmp_path / "out", allow_commands=True)
     assert ready.wait(PATIENCE_S)
     frames = [m for m in drives.first_frames(messages, 12) if m.topic in (CLOUD_TOPIC, IMAGE_TOPIC)]
     for topic in (CLOUD_TOPIC, IMAGE_TOPIC):
@@ -144,9 +147,13 @@ def test_a_drift_is_told_on_the_bus_and_the_watch_ends_when_it_is_told_to(
     assert answer["seq"] >= status["seq"]
     tokens = [reply.ok for reply in hub.liveliness().get("calibwatch/van-1/alive")]
     assert len(tokens) == 1
+    acknowledge(hub, "van-1", "front", Note(by="Ada", reason="bracket tightened"))
+    assert until(said, lambda status: status["seq"] > answer["seq"] and status["severity"] is None)
+    with pytest.raises(TransportError, match="no drift is told"):
+        acknowledge(hub, "van-1", "front", Note(by="Ada", reason="once more"))
     stop.set()
     # Nothing came after the frames: by the time of the stop the inputs may be stale already.
-    assert ended.get(timeout=PATIENCE_S) in ("drifted", "stale")
+    assert ended.get(timeout=PATIENCE_S) in ("starting", "stale")
     subscriber.undeclare()
     summary = json.loads((tmp_path / "out" / "summary.json").read_bytes())
     assert summary["complete"] is False
@@ -170,6 +177,8 @@ def test_what_the_rig_leaves_open_comes_from_the_bus(hub, daemon, messages, tmp_
             matched(hub, rmw_key(message))
             put(hub, message)
     assert ready.wait(PATIENCE_S)
+    with pytest.raises(TransportError, match="--allow-commands"):
+        acknowledge(hub, "van-1", "front", Note(by="Ada", reason="without the right to"))
     for topic in (CLOUD_TOPIC, IMAGE_TOPIC):
         matched(hub, rmw_key(next(m for m in frames if m.topic == topic)))
     for message in frames:

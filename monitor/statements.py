@@ -103,7 +103,9 @@ def status_of(
         since_ns=memory.since_ns,
         onset=None
         if onset is None
-        else Onset(stamp_ns=onset.stamp_ns, from_ns=onset.from_ns, to_ns=onset.to_ns),
+        else Onset(
+            stamp_ns=onset.stamp_ns, from_ns=onset.from_ns, to_ns=onset.to_ns, gradual=onset.gradual
+        ),
         severity=memory.severity,
         drift=_drift(mount, memory, belief),
         consequence=_consequence(mount, belief),

@@ -88,9 +88,10 @@ class _Part(BaseModel):
 class Onset(_Part):
     """Since when the drift is there: most likely stamp and interval."""
 
-    stamp_ns: int
-    from_ns: int
-    to_ns: int
+    stamp_ns: int = Field(description="most likely; from_ns where nothing before was surely free of it")
+    from_ns: int = Field(description="not before: the interval holds the beginning with 95 %")
+    to_ns: int = Field(description="not after")
+    gradual: bool = Field(default=False, description="it grew rather than jumped; the first growth is told")
 
 
 class AxisDrift(_Part):

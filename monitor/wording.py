@@ -142,7 +142,8 @@ def _onset_text(status: Status) -> str:
         return f"told since {stamp_text(status.since_ns)}"
     if onset.stamp_ns == onset.from_ns:
         return f"since {stamp_text(onset.from_ns)} or before, where the data begin"
-    return f"since {stamp_text(onset.stamp_ns)} (between {span_text(onset.from_ns, onset.to_ns)})"
+    since = "growing since" if onset.gradual else "since"
+    return f"{since} {stamp_text(onset.stamp_ns)} (between {span_text(onset.from_ns, onset.to_ns)})"
 
 
 def _clause(sentence: str) -> str:

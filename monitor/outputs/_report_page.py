@@ -11,7 +11,7 @@ from monitor.outputs._history import Change
 from monitor.outputs._overlays import Crop, Overlay
 from monitor.outputs._series import Sample
 from monitor.status import AXIS_NAMES, AxisDrift, AxisName, Status, Witness, first_in_precedence, unit_of
-from monitor.wording import NEXT_STEPS, moved_axes, size_text, stamp_text, verdict_sentence
+from monitor.wording import NEXT_STEPS, moved_axes, size_text, span_text, stamp_text, verdict_sentence
 
 _MOST_CHANGES_SHOWN = 60
 """rows of the table of states; the first and the last half of them are shown."""
@@ -103,6 +103,7 @@ def _pair(index: int, pair: PairMaterial) -> dict[str, Any]:
         "signs": f"{_SIGNS[status.drift.axes]}, {_RELATIVE[status.drift.relative_to]}. Signs: +yaw turns "
         "left, +pitch nose down, +roll right side down; forward, left and up are those of the camera centre.",
         "strip": _strip(pair),
+        "onset": _onset_mark(pair),
         "states_seen": list(dict.fromkeys(change.state for change in pair.timeline)),
         "timeline": [
             change.model_dump()
@@ -169,6 +170,25 @@ def _strip(pair: PairMaterial) -> list[dict[str, Any]]:
     ]
 
 
+def _onset_mark(pair: PairMaterial) -> dict[str, str] | None:
+    """Where the onset lies in the strip of states, with its interval; None where there is none."""
+    onset = pair.last.onset
+    if onset is None:
+        return None
+    total = max(1, pair.last.stamp_ns - pair.first_ns)
+    at, first, last = (
+        1000 * min(max(stamp - pair.first_ns, 0), total) / total
+        for stamp in (onset.stamp_ns, onset.from_ns, onset.to_ns)
+    )
+    return {
+        "at": f"{at:.2f}",
+        "x": f"{first:.2f}",
+        "width": f"{max(last - first, 1.0):.2f}",
+        "label": f"the drift began {stamp_text(onset.stamp_ns)}, "
+        f"between {span_text(onset.from_ns, onset.to_ns)}",
+    }
+
+
 def _plotted(index: int, pair: PairMaterial) -> dict[str, Any]:
     """What the script draws: seconds from the start, degrees and metres."""
 
@@ -182,7 +202,9 @@ def _plotted(index: int, pair: PairMaterial) -> dict[str, Any]:
     return {
         "name": pair.last.pair,
         "seconds": [second(sample.stamp_ns) for sample in pair.samples],
-        "onset": None if onset is None else second(onset.stamp_ns),
+        "onset": None
+        if onset is None
+        else {"at": second(onset.stamp_ns), "from": second(onset.from_ns), "to": second(onset.to_ns)},
         "states": [
             {"state": change.state, "from": second(start), "to": second(end)}
             for change, start, end in _spans(pair)

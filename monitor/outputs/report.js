@@ -5,7 +5,7 @@
   const tints = { healthy: "#1f8a54", suspect: "#e09a1a", drifted: "#c62828", unobservable: "#69727d",
     stale: "#4a5b80", fault: "#7b2d8b", starting: "#a9b6c3" };
 
-  // The states lie behind the curve, faint; the limits stand as red lines, the onset as a black one.
+  // The states lie behind the curve, faint; the limits stand as red lines, the onset as a black one in its interval.
   function background(u, pair, limit) {
     const { ctx, bbox } = u;
     ctx.save();
@@ -29,7 +29,10 @@
       ctx.stroke();
     }
     if (pair.onset !== null) {
-      const x = u.valToPos(pair.onset, "x", true);
+      const from = u.valToPos(pair.onset.from, "x", true);
+      ctx.fillStyle = "#1d253026";
+      ctx.fillRect(from, bbox.top, Math.max(u.valToPos(pair.onset.to, "x", true) - from, 1), bbox.height);
+      const x = u.valToPos(pair.onset.at, "x", true);
       ctx.strokeStyle = "#1d2530";
       ctx.setLineDash([2 * devicePixelRatio, 3 * devicePixelRatio]);
       ctx.beginPath();

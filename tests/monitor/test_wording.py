@@ -76,6 +76,12 @@ def test_drifted_names_axis_size_sigma_limit_since_when_and_what_was_not_checked
     )
 
 
+def test_a_drift_that_grew_is_told_to_grow():
+    onset = {"stamp_ns": NOON + 10**9, "from_ns": NOON, "to_ns": NOON + 3 * 10**9, "gradual": True}
+    said = verdict_sentence(status("drifted", {"yaw": {"value": -0.81}}, severity="major", onset=onset))
+    assert "growing since 2011-09-26 13:02:26.0 UTC (between" in said
+
+
 def test_healthy_names_the_axes_that_were_checked_and_no_other():
     said = verdict_sentence(status("healthy", {"forward": HELD, "up": BLUNT}))
     claim, rest = said.split("; not checked: ")

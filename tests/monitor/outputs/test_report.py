@@ -84,7 +84,7 @@ def test_plots_carry_the_drift_and_the_states(page, drive):
         ("suspect", 26, 30),
         ("drifted", 30, 60),
     ]
-    assert pair["onset"] == 21
+    assert pair["onset"] == {"at": 21, "from": 19, "to": 24}
     assert all(f'id="{axis["id"]}"' in page for axis in pair["axes"])
 
 

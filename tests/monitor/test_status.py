@@ -44,7 +44,7 @@ STATUS = {
     "code": "first_threshold",
     "reason": "Yaw moves.",
     "since_ns": 1,
-    "onset": {"stamp_ns": 1, "from_ns": 0, "to_ns": 2},
+    "onset": {"stamp_ns": 1, "from_ns": 0, "to_ns": 2, "gradual": True},
     "severity": None,
     "drift": {"axes": "vehicle", "relative_to": "stored"} | dict.fromkeys(AXES, AXIS),
     "consequence": [

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from monitor.baseline_file import with_baselines
 from monitor.discovery import TF_TYPES, Survey, discover, survey_in
 from monitor.inspection_report import (
     CloudReport,
@@ -117,7 +118,7 @@ def _rig(
         found = discover(survey)
         return found.rig, dict(note.split(": ", 1) for note in found.notes), found.missing
     try:
-        prepared = prepare(location, rig_file, None)
+        prepared = prepare(location, rig_file, None, known=lambda rig: with_baselines(rig, None))
     except CalibwatchError as error:
         if rig_file is not None:
             raise
@@ -125,8 +126,16 @@ def _rig(
     open_ones = (
         () if rig_file is None else (p.name for p in load_rig(rig_file).pairs if p.T_cam_lidar is None)
     )
-    how = {pair.name: "; ".join(prepared.notes) for pair in prepared.rig.pairs}
+    how = {pair.name: "; ".join((*prepared.notes, *_learned(pair))) for pair in prepared.rig.pairs}
     return prepared.rig, how | {name: f"{how[name]}; extrinsic from tf" for name in open_ones}, ()
+
+
+def _learned(pair: RigPair) -> tuple[str, ...]:
+    """That a pair has a baseline, and how much road it rests on."""
+    if pair.baseline is None:
+        return ()
+    count = len(pair.baseline.stretches)
+    return (f"baseline of {count} stretch{'es' if count != 1 else ''} of road",)
 
 
 def _read_through(source: Source) -> tuple[dict[str, _Seen], Survey]:

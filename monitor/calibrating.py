@@ -23,12 +23,12 @@ from monitor.status import AXIS_NAMES, AxisName, unit_of
 from pipeline import se3
 from pipeline.calibration import Calibrated, CalibrationParameters, Calibrator
 from pipeline.errors import RigError
+from pipeline.frame_evidence import DropReason
 from pipeline.frame_modes import Prior
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, FramePair
 from pipeline.segmentation import Segmenter
-from pipeline.watch import DropReason
 
 FOUND = Prior(sigma_rad=math.radians(1.5), sigma_m=0.25)
 """How far off a first guess is that was found with no stored extrinsic: 95 of 100 within 3 deg, 0.5 m."""

@@ -19,6 +19,7 @@ from pipeline.cloud_poles import find_poles
 from pipeline.edge_witness import EdgeBatch, EdgeFrame, batch_of
 from pipeline.edges import Edges, find_edges
 from pipeline.ego import Ego
+from pipeline.frame_evidence import DropReason, Stage
 from pipeline.frame_modes import EdgeModes, ModeParameters, Prior, evened, find_tops, joined_by, weighed
 from pipeline.gradients import GradientPyramid, gradient_pyramid
 from pipeline.ground import Ground, fit_ground
@@ -31,7 +32,6 @@ from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, Floats, FramePair, PointCloud, read_only
 from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter, grid_scale
-from pipeline.watch import DropReason, Stage
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.frame_evidence import DropReason
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, FramePair
 from pipeline.road_samples import WindowEstimates
 from pipeline.segmentation import Segmenter
 from pipeline.verdict import Memory
-from pipeline.watch import DropReason, Watch
+from pipeline.watch import Watch
 
 
 @dataclass(frozen=True, slots=True, eq=False)

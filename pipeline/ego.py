@@ -4,6 +4,7 @@ A cloud with times per point is straightened by them. One without is straightene
 sense of rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise.
 """
 
+import copy
 from collections import deque
 from dataclasses import dataclass
 
@@ -95,6 +96,12 @@ class Ego:
     def twist(self) -> Twist | None:
         """Motion at the last registration, or None where it is not known."""
         return self._twist
+
+    def copy(self) -> "Ego":
+        """Another that goes on from here."""
+        other = copy.copy(self)
+        other._evidence, other._recent = list(self._evidence), self._recent.copy()  # noqa: SLF001 - its own kind
+        return other
 
     def forget(self) -> None:
         """The stream was interrupted: the next sweep stands alone."""

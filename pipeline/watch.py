@@ -3,54 +3,27 @@
 Pure: no files, no clock. What a stage costs is measured by the caller through ``stage``.
 """
 
-import dataclasses
 from collections import Counter, deque
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline import edge_witness, line_witness, scene_sum, verdict, window
+from pipeline import scene_sum, verdict, window
 from pipeline.belief import Belief, believe
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
-from pipeline.edge_witness import EdgeFrame
-from pipeline.edges import RING_JUMP, Edges, find_edges
-from pipeline.ego import Ego, Straightened
-from pipeline.gradients import GradientPyramid, gradient_pyramid
-from pipeline.ground import Ground, fit_ground
+from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, unmeasured
 from pipeline.line_witness import LineFrame
-from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.mount import Mount
 from pipeline.onset import Onset
 from pipeline.parameters import Parameters
-from pipeline.records import Floats, FramePair, Masks, PointCloud
-from pipeline.rings import sensor_origin
+from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.scene_filter import Scene
-from pipeline.segmentation import Segmenter, grid_scale
+from pipeline.segmentation import Segmenter
 
-Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
-DropReason: TypeAlias = Literal["image_size", "empty_cloud", "no_scan_pattern", "no_edges"]
-"""Why a pair gave no evidence, closed list.
-
-image_size: the image is not of the size that the intrinsics are for.
-empty_cloud: the sweep holds no point.
-no_scan_pattern: the cloud shows no rings, and the frame had no lines either.
-no_edges: no edge of the cloud falls into the image.
-"""
-
-
-def _unmeasured(name: str) -> AbstractContextManager[None]:
-    """A stage whose cost nobody asked for."""
-    del name
-    return nullcontext()
-
-
-_LEAST_EDGES = 20
-"""Edges below which a frame says nothing: three per axis."""
-
+if TYPE_CHECKING:
+    from pipeline.edge_witness import EdgeFrame
 
 _SCENE_STAMPS = 1024
 """Scenes whose stamps are kept: 20 km; a drift that began before is told to have begun before the data."""
@@ -77,6 +50,21 @@ class Findings:
     judged: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Foresight:
+    """What was found in a pair before its turn.
+
+    Attributes:
+        evidence: What the pair says.
+        scout: Goes on after it.
+        breaks: ``Watch.breaks`` when this was begun: what is forgotten later makes it void.
+    """
+
+    evidence: FrameEvidence
+    scout: Scout
+    breaks: int
+
+
 class Watch:
     """The rolling window of one pair, its belief and its verdict.
 
@@ -84,6 +72,9 @@ class Watch:
         mount: What is stored of the pair.
         parameters: Settings.
         segmenter: The network, or None: no masks, no lines.
+
+    Attributes:
+        breaks: How often what was seen before has been forgotten.
     """
 
     def __init__(self, mount: Mount, parameters: Parameters, segmenter: Segmenter | None) -> None:
@@ -92,10 +83,8 @@ class Watch:
         self.memory: verdict.Memory | None = None
         self.belief: Belief | None = None
         self.frames = 0
-        self._segmenter = segmenter
-        ahead = mount.T_cam_lidar[2, :3]
-        self._ego = Ego(mount.up, ahead, mount.spin)
-        self._origin: Floats | None = None
+        self.breaks = 0
+        self._scout = Scout(mount, parameters, segmenter)
         self._edge_frames: deque[EdgeFrame] = deque()
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
         self._dating = Dating(mount.camera, parameters.traces)
@@ -104,9 +93,7 @@ class Watch:
         self._begun_m: float | None = None
         self._begun_ns = 0
         self._judged_ns: int | None = None
-        self._lines_at: tuple[int, float] | None = None
         self.departed: Counter[window.Departure] = Counter()
-        self._count = 0
 
     @property
     def window_stamps(self) -> tuple[int, ...]:
@@ -124,11 +111,23 @@ class Watch:
         """Stamps of the frames with lines in the window, ns."""
         return tuple(stamp for stamp, _ in self._line_frames)
 
-    def step(self, pair: FramePair, stage: Stage = _unmeasured) -> Findings:
-        """Takes one pair in; judges the window when that is due."""
+    def scout(self) -> Scout:
+        """Another scout that looks at the next pair as this watch would."""
+        return self._scout.copy()
+
+    def step(
+        self, pair: FramePair, stage: Stage = unmeasured, foresight: Foresight | None = None
+    ) -> Findings:
+        """Takes one pair in; judges the window when that is due.
+
+        Args:
+            pair: A sweep and its image.
+            stage: Measures the stages.
+            foresight: What was found in the pair before; used if nothing has been forgotten since.
+        """
         now_ns = pair.image_stamp_ns
         self._enter(now_ns)
-        findings = self._evidence_of(pair, stage)
+        findings = self._looked_at(pair, stage, foresight)
         if findings.dropped is not None:
             return findings
         self.frames += 1
@@ -158,7 +157,7 @@ class Watch:
         if self.belief is not None:
             judgement = self.belief.judgement
             self.memory = self._dating.redated(self.memory, self.mount, self._expectation(), self.belief)
-        self.memory = verdict.finish(self.memory, judgement, self._count, self.mount.required)
+        self.memory = verdict.finish(self.memory, judgement, self._scout.count, self.mount.required)
 
     def acknowledge(self, now_ns: int, by: str, why: str) -> bool:
         """A person has taken note of the drift: evidence is collected anew; False where none is told."""
@@ -192,103 +191,32 @@ class Watch:
     def _forget(self) -> None:
         self._edge_frames.clear()
         self._line_frames.clear()
-        self._ego.forget()
+        self._scout.forget()
+        self.breaks += 1
         self._judged_ns = None
-        self._lines_at = None
 
-    def _evidence_of(self, pair: FramePair, stage: Stage) -> Findings:
-        """Edges of the frame, and lines when they are due."""
-        mount, nothing = self.mount, np.zeros((0, 3), dtype=np.float32)
-        if pair.image.size != (mount.camera.width, mount.camera.height):
-            return Findings("image_size", pair.cloud, nothing, None, None, judged=False)
-        if len(pair.cloud) == 0:
-            return Findings("empty_cloud", pair.cloud, nothing, None, None, judged=False)
-        self._count += 1
-        rng = np.random.default_rng([self.parameters.seed, self._count])
-        if self._origin is None:
-            # Of the sweep as it was measured: straightening bends its rings.
-            self._origin = sensor_origin(pair.cloud)
-        with stage("motion"):
-            straight = self._ego.straighten(pair)
-        pair = dataclasses.replace(pair, cloud=straight.cloud)
-        with stage("ground"):
-            ground = fit_ground(pair.cloud, mount.up, rng)
-        with stage("edges"):
-            edges = find_edges(
-                pair.cloud, ground, mount.camera, mount.T_cam_lidar, self.parameters.edges, self._origin
-            )
-        masks, lines = None, None
-        if self._lines_due(now_ns=pair.image_stamp_ns, straight=straight):
-            masks, lines = self._lines_of(pair, ground, rng, stage)
-        enough = edges is not None and len(edges) >= _LEAST_EDGES
-        if edges is not None and enough:
-            with stage("gradients"):
-                gradients = gradient_pyramid(pair.image, mount.camera)
-            self._edge_frames.append(self._informed(pair, edges, gradients, straight))
-            self._dating.see(self._edge_frames[-1])
-        found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
-        dropped: DropReason | None = None
-        if not enough and not found_lines:
-            dropped = "no_scan_pattern" if edges is None else "no_edges"
-        self._retain()
-        points = nothing if edges is None else edges.position[edges.kind == RING_JUMP].astype(np.float32)
-        return Findings(dropped, pair.cloud, points, masks, lines, judged=False)
-
-    def _informed(
-        self, pair: FramePair, edges: Edges, gradients: GradientPyramid, straight: Straightened
-    ) -> EdgeFrame:
-        """The frame as the window keeps it."""
-        mount = self.mount
-        frame = EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m, mount.feigned(straight))
-        information = edge_witness.information_of(frame, mount.camera, mount.T_cam_lidar)
-        return dataclasses.replace(frame, information=information)
-
-    def _lines_due(self, now_ns: int, straight: Straightened) -> bool:
-        """Whether the frame gets masks and lines; it is then the last that got them."""
-        waited_ns, way_m = None, None
-        if self._lines_at is not None:
-            waited_ns = now_ns - self._lines_at[0]
-            way_m = None if straight.twist is None else straight.distance_m - self._lines_at[1]
-        every_ns = self.parameters.lines_every_ns
-        due = window.lines_due(waited_ns, way_m, every_ns, self.parameters.window)
-        if self._segmenter is None or not due:
-            return False
-        self._lines_at = (now_ns, straight.distance_m)
-        return True
-
-    def _lines_of(
-        self, pair: FramePair, ground: Ground | None, rng: np.random.Generator, stage: Stage
-    ) -> tuple[Masks, LineFrame]:
-        """Masks and lines of the frame."""
-        assert self._segmenter is not None  # noqa: S101 - lines are due with a network only
-        mount, now_ns = self.mount, pair.image_stamp_ns
-        with stage("network"):
-            probabilities = self._segmenter.probabilities(pair.image.pixels)
-        with stage("masks"):
-            up_cam = mount.T_cam_lidar[:3, :3] @ mount.up
-            horizon = horizon_line(mount.camera, up_cam)
-            masks = masks_from_probabilities(
-                probabilities,
-                pair.image.pixels,
-                self.parameters.masks,
-                horizon,
-                grid_scale(*pair.image.size),
-            )
-        with stage("lines"):
-            lines = line_witness.find_lines(
-                pair.cloud,
-                pair.image,
-                masks,
-                mount.camera,
-                mount.T_cam_lidar,
-                up=mount.up,
-                forward=mount.forward,
-                rng=rng,
-                ground=ground,
-                origin=self._origin,
-            )
-        self._line_frames.append((now_ns, lines))
-        return masks, lines
+    def _looked_at(self, pair: FramePair, stage: Stage, foresight: Foresight | None) -> Findings:
+        """Takes what the frame says into the window."""
+        if foresight is not None and foresight.breaks == self.breaks:
+            self._scout, evidence = foresight.scout, foresight.evidence
+        else:
+            evidence = self._scout.look(pair, stage)
+        now_ns = pair.image_stamp_ns
+        if evidence.edge_frame is not None:
+            self._edge_frames.append(evidence.edge_frame)
+            self._dating.see(evidence.edge_frame)
+        if evidence.lines is not None:
+            self._line_frames.append((now_ns, evidence.lines))
+        if evidence.straight is not None:
+            self._retain()
+        return Findings(
+            evidence.dropped,
+            evidence.cloud,
+            evidence.edge_points,
+            evidence.masks,
+            evidence.lines,
+            judged=False,
+        )
 
     def _retain(self) -> None:
         """Drops what is too old or too dense from the window."""

@@ -1,0 +1,197 @@
+"""What one pair of sweep and image says by itself: its motion, edges, gradients and lines.
+
+Nothing here knows of the window or the verdict: a frame can be looked at while those before it are judged.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from pipeline import edge_witness, line_witness, window
+from pipeline.edge_witness import EdgeFrame
+from pipeline.edges import RING_JUMP, Edges, find_edges
+from pipeline.ego import Ego, Straightened
+from pipeline.gradients import gradient_pyramid
+from pipeline.ground import Ground, fit_ground
+from pipeline.line_witness import LineFrame
+from pipeline.masks import horizon_line, masks_from_probabilities
+from pipeline.mount import Mount
+from pipeline.parameters import Parameters
+from pipeline.records import Floats, FramePair, Masks, PointCloud
+from pipeline.rings import sensor_origin
+from pipeline.segmentation import Segmenter, grid_scale
+
+Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
+"""Measures what is done inside it, under a name."""
+
+DropReason: TypeAlias = Literal["image_size", "empty_cloud", "no_scan_pattern", "no_edges"]
+"""Why a pair gave no evidence, closed list.
+
+image_size: the image is not of the size that the intrinsics are for.
+empty_cloud: the sweep holds no point.
+no_scan_pattern: the cloud shows no rings, and the frame had no lines either.
+no_edges: no edge of the cloud falls into the image.
+"""
+
+
+def unmeasured(name: str) -> AbstractContextManager[None]:
+    """A stage whose cost nobody asked for."""
+    del name
+    return nullcontext()
+
+
+_LEAST_EDGES = 20
+"""Edges below which a frame says nothing: three per axis."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameEvidence:
+    """What one frame gave.
+
+    Attributes:
+        dropped: Why it gave nothing, or None.
+        cloud: The sweep as it was used.
+        edge_points: float32 (M,3), points at jumps of range, LiDAR frame.
+        straight: How the sweep was brought to the exposure; None where the pair was not looked at.
+        edge_frame: Its edges as a window keeps them, or None where they are too few.
+        masks: Its masks, or None where it got none.
+        lines: Its lines, or None where it got none.
+    """
+
+    dropped: DropReason | None
+    cloud: PointCloud
+    edge_points: np.ndarray
+    straight: Straightened | None = None
+    edge_frame: EdgeFrame | None = None
+    masks: Masks | None = None
+    lines: LineFrame | None = None
+
+
+class Scout:
+    """Looks at the frames of one pair in their order.
+
+    Args:
+        mount: What is stored of the pair.
+        parameters: Settings.
+        segmenter: The network, or None: no masks, no lines.
+    """
+
+    def __init__(self, mount: Mount, parameters: Parameters, segmenter: Segmenter | None) -> None:
+        self._mount = mount
+        self._parameters = parameters
+        self._segmenter = segmenter
+        self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
+        self._origin: Floats | None = None
+        self._lines_at: tuple[int, float] | None = None
+        self._count = 0
+
+    @property
+    def count(self) -> int:
+        """Pairs that were looked at."""
+        return self._count
+
+    def copy(self) -> "Scout":
+        """Another scout that goes on from here."""
+        other = copy.copy(self)
+        other._ego = self._ego.copy()  # noqa: SLF001 - its own kind
+        return other
+
+    def forget(self) -> None:
+        """The stream was interrupted: the next pair stands alone."""
+        self._ego.forget()
+        self._lines_at = None
+
+    def look(self, pair: FramePair, stage: Stage = unmeasured) -> FrameEvidence:
+        """Edges of the frame, and lines when they are due."""
+        mount, nothing = self._mount, np.zeros((0, 3), dtype=np.float32)
+        if pair.image.size != (mount.camera.width, mount.camera.height):
+            return FrameEvidence("image_size", pair.cloud, nothing)
+        if len(pair.cloud) == 0:
+            return FrameEvidence("empty_cloud", pair.cloud, nothing)
+        self._count += 1
+        rng = np.random.default_rng([self._parameters.seed, self._count])
+        if self._origin is None:
+            # Of the sweep as it was measured: straightening bends its rings.
+            self._origin = sensor_origin(pair.cloud)
+        with stage("motion"):
+            straight = self._ego.straighten(pair)
+        pair = dataclasses.replace(pair, cloud=straight.cloud)
+        with stage("ground"):
+            ground = fit_ground(pair.cloud, mount.up, rng)
+        with stage("edges"):
+            edges = find_edges(
+                pair.cloud, ground, mount.camera, mount.T_cam_lidar, self._parameters.edges, self._origin
+            )
+        masks, lines = None, None
+        if self._lines_due(pair.image_stamp_ns, straight):
+            masks, lines = self._lines_of(pair, ground, rng, stage)
+        edge_frame = None
+        if edges is not None and len(edges) >= _LEAST_EDGES:
+            edge_frame = self._edge_frame(pair, edges, straight, stage)
+        found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
+        dropped: DropReason | None = None
+        if edge_frame is None and not found_lines:
+            dropped = "no_scan_pattern" if edges is None else "no_edges"
+        points = nothing if edges is None else edges.position[edges.kind == RING_JUMP].astype(np.float32)
+        return FrameEvidence(dropped, pair.cloud, points, straight, edge_frame, masks, lines)
+
+    def _edge_frame(self, pair: FramePair, edges: Edges, straight: Straightened, stage: Stage) -> EdgeFrame:
+        """The edges as a window keeps them."""
+        mount = self._mount
+        with stage("gradients"):
+            gradients = gradient_pyramid(pair.image, mount.camera)
+        frame = EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m, mount.feigned(straight))
+        with stage("information"):
+            information = edge_witness.information_of(frame, mount.camera, mount.T_cam_lidar)
+        return dataclasses.replace(frame, information=information)
+
+    def _lines_due(self, now_ns: int, straight: Straightened) -> bool:
+        """Whether the frame gets masks and lines; it is then the last that got them."""
+        waited_ns, way_m = None, None
+        if self._lines_at is not None:
+            waited_ns = now_ns - self._lines_at[0]
+            way_m = None if straight.twist is None else straight.distance_m - self._lines_at[1]
+        every_ns = self._parameters.lines_every_ns
+        due = window.lines_due(waited_ns, way_m, every_ns, self._parameters.window)
+        if self._segmenter is None or not due:
+            return False
+        self._lines_at = (now_ns, straight.distance_m)
+        return True
+
+    def _lines_of(
+        self, pair: FramePair, ground: Ground | None, rng: np.random.Generator, stage: Stage
+    ) -> tuple[Masks, LineFrame]:
+        """Masks and lines of the frame."""
+        assert self._segmenter is not None  # noqa: S101 - lines are due with a network only
+        mount = self._mount
+        with stage("network"):
+            probabilities = self._segmenter.probabilities(pair.image.pixels)
+        with stage("masks"):
+            up_cam = mount.T_cam_lidar[:3, :3] @ mount.up
+            horizon = horizon_line(mount.camera, up_cam)
+            masks = masks_from_probabilities(
+                probabilities,
+                pair.image.pixels,
+                self._parameters.masks,
+                horizon,
+                grid_scale(*pair.image.size),
+            )
+        with stage("lines"):
+            lines = line_witness.find_lines(
+                pair.cloud,
+                pair.image,
+                masks,
+                mount.camera,
+                mount.T_cam_lidar,
+                up=mount.up,
+                forward=mount.forward,
+                rng=rng,
+                ground=ground,
+                origin=self._origin,
+            )
+        return masks, lines

@@ -87,8 +87,12 @@ def heard(scene: Scene, mount: Floats, uncertainty: Floats, most_square: float) 
     return np.asarray(scene.covariance + max(0.0, square / most_square - 1.0) * expected)
 
 
-def updated(mean: Floats, covariance: Floats, scene: Scene, noise: Floats) -> tuple[Floats, Floats]:
-    """Filters after a scene, whose random error has covariance ``noise`` (6,6): Kalman's update."""
+def updated(mean: Floats, covariance: Floats, scene: Scene, noise: Floats) -> tuple[Floats, Floats, Floats]:
+    """Filters after a scene, whose random error has covariance ``noise`` (6,6): Kalman's update.
+
+    Returns:
+        Means (n,13), covariances (n,13,13), and how far off each had expected the scene, squared sigmas (n,).
+    """
     f = scene.feigned
     # A scene shows m + s + f tau: sums of columns and rows are a tenth of the work of products with H.
     seen = covariance[:, :, :6] + covariance[:, :, 6:12] + covariance[:, :, 12:] * f
@@ -96,4 +100,6 @@ def updated(mean: Floats, covariance: Floats, scene: Scene, noise: Floats) -> tu
     gain = np.swapaxes(np.linalg.solve(expected, np.swapaxes(seen, 1, 2)), 1, 2)
     off = scene.drift - (mean[:, :6] + mean[:, 6:12] + mean[:, 12:] * f)
     covariance = covariance - gain @ np.swapaxes(seen, 1, 2)
-    return mean + (gain @ off[..., None])[..., 0], 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+    squares = np.einsum("ni,ni->n", off, np.linalg.solve(expected, off[..., None])[..., 0])
+    mean = mean + (gain @ off[..., None])[..., 0]
+    return mean, 0.5 * (covariance + np.swapaxes(covariance, 1, 2)), squares

@@ -5,7 +5,8 @@ beginning of a stretch a filter of its own (``scene_filter``) estimates the moun
 nothing; another one estimates it over all that came before, from what is expected of an unmoved mount. The
 statistic is the squared difference of the two in sigmas, for the beginning where it is largest. The
 systematic parts before and after count as independent, as around a corner: where they agree, alarms are rarer
-still. What a scene does not see carries no information in that direction, which a vector sum of whitened
+still. Where the scenes of a stretch contradict each other, its sigmas grow by what they differ (Birge's
+ratio). What a scene does not see carries no information in that direction, which a vector sum of whitened
 innovations could not take into account (FORMULAS F3).
 """
 
@@ -64,6 +65,8 @@ class SceneSum:
         covariance: float64 (n,13,13), likewise.
         before: float64 (n,6), the mount as known before each stretch began (row 0: zeros).
         before_covariance: float64 (n,6,6), likewise.
+        scatter: float64 (n,), sum of the squares, in sigmas, by which scenes surprised each filter, but for
+            the first scene of a stretch.
         first: int64 (n,), number of the scene with which each stretch begins.
         first_ns: int64 (n,), its stamp.
         statistics: float64 (n,), squared difference of before and since, in sigmas (row 0: zero).
@@ -75,13 +78,14 @@ class SceneSum:
     covariance: Floats
     before: Floats
     before_covariance: Floats
+    scatter: Floats
     first: np.ndarray
     first_ns: np.ndarray
     statistics: Floats
 
     def __post_init__(self) -> None:
-        names = ("mean", "covariance", "before", "before_covariance", "first", "first_ns", "statistics")
-        for name in names:
+        names = ("mean", "covariance", "before", "before_covariance", "scatter", "first", "first_ns")
+        for name in (*names, "statistics"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
@@ -118,6 +122,7 @@ def begin(expectation: Expectation) -> SceneSum:
         covariance=scene_filter.prior(expectation.covariance, expectation.floor)[None],
         before=np.zeros((1, 6)),
         before_covariance=np.zeros((1, 6, 6)),
+        scatter=np.zeros(1),
         first=np.zeros(1, dtype=np.int64),
         first_ns=np.zeros(1, dtype=np.int64),
         statistics=np.zeros(1),
@@ -153,19 +158,26 @@ def advance(
     before, before_covariance = mean[0, :6], covariance[0, :6, :6]
     noise = scene_filter.heard(scene, before, before_covariance + expectation.floor, parameters.most_square)
     fresh = scene_filter.prior(np.diag(_FARTHEST**2), expectation.floor)
-    mean = np.concatenate([mean, np.zeros((1, scene_filter.STATES))])
-    covariance = np.concatenate([covariance, fresh[None]])
-    mean, covariance = scene_filter.updated(mean, covariance, scene, noise)
+    mean, covariance, squares = scene_filter.updated(
+        np.concatenate([mean, np.zeros((1, scene_filter.STATES))]),
+        np.concatenate([covariance, fresh[None]]),
+        scene,
+        noise,
+    )
+    # The first scene of a stretch surprises nobody: nothing was expected.
+    scatter = np.append(total.scatter + squares[:-1], 0.0)
     before = np.concatenate([total.before, before[None]])
-    before_covariance = np.concatenate([total.before_covariance, before_covariance[None]])
+    widened = before_covariance * _excess(total.scatter[:1], np.array([total.scenes]))
+    before_covariance = np.concatenate([total.before_covariance, widened[None]])
     first = np.append(total.first, total.scenes)
     kept = _kept(first, total.scenes)
-    mean, covariance, before, before_covariance = (
-        values[kept] for values in (mean, covariance, before, before_covariance)
+    mean, covariance, before, before_covariance, scatter, first = (
+        values[kept] for values in (mean, covariance, before, before_covariance, scatter, first)
     )
     difference = mean[:, :6] - before
-    error = covariance[:, :6, :6] + before_covariance
-    statistics = np.einsum("ni,ni->n", difference, np.linalg.solve(error, difference[..., None])[..., 0])
+    since = covariance[:, :6, :6] * _excess(scatter, total.scenes - first)[:, None, None]
+    whole = np.linalg.solve(since + before_covariance, difference[..., None])[..., 0]
+    statistics = np.einsum("ni,ni->n", difference, whole)
     # The unmoved mount's own filter is no stretch.
     statistics[0] = 0.0
     return SceneSum(
@@ -175,7 +187,8 @@ def advance(
         covariance=covariance,
         before=before,
         before_covariance=before_covariance,
-        first=first[kept],
+        scatter=scatter,
+        first=first,
         first_ns=np.append(total.first_ns, scene.stamp_ns)[kept],
         statistics=statistics,
     )
@@ -189,6 +202,14 @@ def alarming(total: SceneSum, parameters: SceneSumParameters) -> bool:
 def suspicious(total: SceneSum, parameters: SceneSumParameters) -> bool:
     """Whether the sum wants more evidence."""
     return total.scenes > 0 and total.statistic > suspicion_level(total.scenes, parameters.budget)
+
+
+def _excess(scatter: Floats, scenes: np.ndarray) -> Floats:
+    """By how much scenes scatter more than they state, squared, at least 1 (Birge's ratio), (n,).
+
+    Where false modes abound, sigmas are too small; that scenes contradict each other tells.
+    """
+    return np.asarray(np.maximum(1.0, scatter / (6.0 * np.maximum(scenes, 1))), dtype=np.float64)
 
 
 def _kept(first: np.ndarray, newest: int) -> np.ndarray:

@@ -89,5 +89,5 @@ def followed(
     covariance[:, range(6), range(6)] += hours * walk
     doubt = covariance[0, :6, :6] + expectation.floor
     noise = scene_filter.heard(scene, mean[0, :6], doubt, parameters.most_square)
-    mean, covariance = scene_filter.updated(mean, covariance, scene, noise)
+    mean, covariance, _ = scene_filter.updated(mean, covariance, scene, noise)
     return SceneTrack(track.scenes + 1, scene.way_m, scene.stamp_ns, mean[0], covariance[0])

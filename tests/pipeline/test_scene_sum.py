@@ -59,7 +59,7 @@ def drawn(
 
 
 def least_squares(drifts: Floats, prior: Floats | None) -> tuple[Floats, Floats]:
-    """The mount and its covariance from the dense covariance of all scenes together."""
+    """The mount and its covariance from the dense covariance of all scenes together, with Birge's ratio."""
     n, floor = len(drifts), STORED.floor
     way = NEW_SCENE_M * np.arange(n)
     streets = np.kron(np.exp(-np.abs(way[:, None] - way[None, :]) / UNCAPPED.correlation_m), floor)
@@ -70,7 +70,11 @@ def least_squares(drifts: Floats, prior: Floats | None) -> tuple[Floats, Floats]
     if prior is not None:
         information = information + np.linalg.inv(prior)
     covariance: Floats = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    return covariance @ design.T @ inverse @ drifts.ravel(), covariance
+    mount = covariance @ design.T @ inverse @ drifts.ravel()
+    left = drifts.ravel() - design @ mount
+    square = left @ inverse @ left + (0.0 if prior is None else mount @ np.linalg.solve(prior, mount))
+    scenes = n if prior is not None else n - 1
+    return mount, covariance * max(1.0, square / (6.0 * max(scenes, 1)))
 
 
 def test_statistic_is_that_of_dense_least_squares_for_every_beginning() -> None:
@@ -176,6 +180,19 @@ def test_alarms_are_no_more_frequent_than_the_budget_allows() -> None:
                     break
         # 2000 scenes allow 10; Poisson of mean 10 exceeds 20 once in 600.
         assert alarms <= 20
+
+
+def test_scenes_that_contradict_each_other_are_no_drift() -> None:
+    # False modes: four times as far off as stated, another way each time.
+    rng, parameters, alarms = np.random.default_rng(10), SceneSumParameters(), 0
+    for _ in range(10):
+        total, root = begin(STORED), 4.0 * np.linalg.cholesky(9.0 * NOISE)
+        for index in range(60):
+            total = advance(total, scene(root @ rng.normal(size=6), index, 9.0 * NOISE), STORED, parameters)
+            if alarming(total, parameters):
+                alarms += 1
+                break
+    assert alarms <= 1
 
 
 def test_beginnings_get_sparse_and_the_first_stays() -> None:

@@ -110,6 +110,9 @@ class Edges:
         return len(self.position)
 
 
+_STRAIGHT = 1e-9
+"""Sine of a tilt that is none."""
+
 CELLS = CELL_COLUMNS * CELL_ROWS
 """Number of image cells."""
 
@@ -121,6 +124,7 @@ def find_edges(
     T_cam_lidar: Floats,
     parameters: EdgeParameters,
     origin: Floats | None = None,
+    axis: Floats | None = None,
 ) -> Edges | None:
     """Edges of the cloud that fall into the image or just beside it; None where the cloud shows no rings.
 
@@ -132,15 +136,21 @@ def find_edges(
         parameters: What counts as an edge.
         origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
             its origin.
+        axis: float64 (3,), unit, about which it spins (``rings.sensor_seat``); None: an axis of that frame.
     """
-    if origin is not None and origin.any():
-        there = dataclasses.replace(cloud, xyz=cloud.xyz - origin.astype(np.float32))
+    T_lidar_sensor = _seated(origin, axis)
+    if T_lidar_sensor is not None:
+        R, t = T_lidar_sensor[:3, :3], T_lidar_sensor[:3, 3]
+        there = dataclasses.replace(cloud, xyz=((cloud.xyz - t) @ R).astype(np.float32))
         plane = None
         if ground is not None:
-            plane = dataclasses.replace(ground, offset=ground.offset + float(ground.normal @ origin))
-        moved = T_cam_lidar @ se3.transform(np.eye(3), origin)
-        found = find_edges(there, plane, camera, moved, parameters)
-        return None if found is None else dataclasses.replace(found, position=found.position + origin)
+            offset = ground.offset + float(ground.normal @ t)
+            plane = dataclasses.replace(ground, normal=R.T @ ground.normal, offset=offset)
+        found = find_edges(there, plane, camera, T_cam_lidar @ T_lidar_sensor, parameters)
+        if found is None:
+            return None
+        position, direction = found.position @ R.T + t, found.direction @ R.T
+        return dataclasses.replace(found, position=position, direction=direction)
     for turn in spin_turns(cloud):
         if np.array_equal(turn, np.eye(3)):
             found = _about_z(cloud, ground, camera, T_cam_lidar, parameters)
@@ -155,6 +165,25 @@ def find_edges(
         if found is not None:
             return found
     return None
+
+
+def _seated(origin: Floats | None, axis: Floats | None) -> Floats | None:
+    """T_lidar_sensor (4,4) of a sensor that spins about its own axis; None: the cloud has that frame.
+
+    The axis of the cloud's frame that is nearest to the spin axis is turned to it the shortest way.
+    """
+    t = np.zeros(3) if origin is None else origin
+    R = np.eye(3)
+    if axis is not None:
+        nearest = int(np.argmax(np.abs(axis)))
+        own = np.sign(axis[nearest]) * np.eye(3)[nearest]
+        across = np.cross(own, axis)
+        sine = float(np.linalg.norm(across))
+        if sine > _STRAIGHT:
+            R = se3.exp_so3(across / sine * math.atan2(sine, float(own @ axis)))
+    if not t.any() and np.array_equal(R, np.eye(3)):
+        return None
+    return se3.transform(R, t)
 
 
 def _about_z(

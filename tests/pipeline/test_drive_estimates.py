@@ -62,7 +62,9 @@ def test_the_bias_is_what_the_mount_shows_against_the_extrinsic_that_is_stored()
     sigma = np.sqrt(np.diag(found.covariance))
     assert (np.abs(found.bias - wrong) < 3.0 * sigma).all()
     before = learn([driven().estimates], Parameters().test, 1e7, np.random.default_rng(0))
-    assert found.bias - before.bias == pytest.approx(wrong, abs=2.5e-3 + 0.0)
+    shown = found.bias - before.bias
+    assert shown[:3] == pytest.approx(wrong[:3], abs=2e-4)
+    assert shown[3:] == pytest.approx(wrong[3:], abs=2e-3)
 
 
 def test_a_baseline_takes_the_place_of_the_stored_extrinsic():

@@ -20,6 +20,7 @@ from pipeline.line_witness import LineFrame
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, read_only
+from pipeline.verdict import Memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,17 +30,15 @@ class CandidateParameters:
     Attributes:
         agreeing: Windows that agree, from which a proposal is more than one window's word (PROBE 11).
         agreement: Chance, at least, of windows differing so much where all mean the same mount.
-        least_frames: Frames of one window, at least, when some of them are held out: single frames are off
-            by 0.2 deg (PROBE 2), so that two thirds of them should be more than five.
-        held_share: Share of the only window's frames, the newest, that are held out.
+        least_frames: Frames of one window, at least, when half of them are held out: single frames are off
+            by 0.2 deg (PROBE 2), so that each half should have some.
         most_windows: Windows remembered: with more the floor between scenes outweighs what one more adds.
         hold_out: Of the check.
     """
 
     agreeing: int = 3
     agreement: float = 1e-3
-    least_frames: int = 9
-    held_share: float = 1.0 / 3.0
+    least_frames: int = 8
     most_windows: int = 12
     hold_out: HoldOutParameters = field(default_factory=HoldOutParameters)
 
@@ -170,27 +169,59 @@ class Proposer:
     Args:
         mount: What is stored of the pair.
         parameters: Settings of the pair.
-        criteria: What a proposal asks for.
+        criteria: What a proposal asks for; None: the defaults.
     """
 
-    def __init__(self, mount: Mount, parameters: Parameters, criteria: CandidateParameters) -> None:
+    def __init__(
+        self, mount: Mount, parameters: Parameters, criteria: CandidateParameters | None = None
+    ) -> None:
         self._mount = mount
         self._parameters = parameters
-        self._criteria = criteria
+        self._criteria = criteria or CandidateParameters()
         self._windows: list[WindowEstimate] = []
         self._tried_ns: int | None = None
         self.proposal: Proposal | None = None
 
-    def forget(self, *, proposal: bool) -> None:
-        """Begins anew: stamps or ways of before mean nothing; with ``proposal`` the mount is another one."""
+    def forget(self) -> None:
+        """Begins anew, without windows: stamps and ways of before mean nothing. A proposal stands."""
         self._windows.clear()
         self._tried_ns = None
-        if proposal:
+
+    def follow(
+        self,
+        moved_ns: int | None,
+        belief: Belief | None,
+        frames: Sequence[EdgeFrame],
+        lines: Sequence[tuple[int, LineFrame]],
+        now_ns: int,
+        *,
+        ended: bool = False,
+    ) -> None:
+        """Takes a window after its judgement; proposes where there is something to add.
+
+        Args:
+            moved_ns: Stamp from which frames show the moved mount (:func:`moved_since`); None: it has not
+                moved, and what was proposed before is void.
+            belief: What is believed after the window, or None.
+            frames: The window's frames with edges, ascending in time.
+            lines: Those with lines, each after its stamp, likewise.
+            now_ns: Stamp of the data.
+            ended: No frame will follow: what there is must do.
+        """
+        if moved_ns is None:
+            self.forget()
             self.proposal = None
+            return
+        shown = [frame for frame in frames if frame.stamp_ns >= moved_ns]
+        if belief is not None and len(shown) == len(frames):
+            self.note(belief, shown)
+        if ended or self.due(shown):
+            self.propose(shown, lines, now_ns)
 
     def note(self, belief: Belief, frames: Sequence[EdgeFrame]) -> None:
         """Takes what a window says in which all frames show the moved mount."""
-        if len(frames) < self._criteria.least_frames or not belief.judgement.alarming:
+        silent = belief.edges is None or belief.judgement.blind or belief.judgement.contradicted
+        if silent or len(frames) < self._criteria.least_frames:
             return
         window = window_estimate(self._mount, belief, frames)
         if self._windows and not _apart(self._windows[-1], window):
@@ -233,8 +264,8 @@ class Proposer:
         windows = self._agreeing(frames[0], floor)
         held = frames
         if not windows:
-            cut = len(frames) - max(1, round(len(frames) * self._criteria.held_share))
-            made, held = frames[:cut], frames[cut:]
+            middle = len(frames) // 2
+            made, held = frames[:middle], frames[middle:]
             older = [frame for stamp, frame in lines if stamp < held[0].stamp_ns]
             belief = believe(self._mount, self._parameters, made, older)
             if belief is None or belief.judgement.blind or belief.judgement.contradicted:
@@ -271,6 +302,15 @@ class Proposer:
         while not agree(earlier, floor, self._criteria.agreement):
             earlier = earlier[1:]
         return earlier
+
+
+def moved_since(memory: Memory) -> int | None:
+    """Stamp from which frames show the moved mount, ns; None where no drift stands."""
+    if memory.severity is None or memory.onset is None:
+        return None
+    # At the beginning of its interval the onset says that nothing before was free of the drift.
+    always = memory.onset.stamp_ns == memory.onset.from_ns
+    return memory.onset.from_ns if always else memory.onset.to_ns
 
 
 def _apart(before: WindowEstimate, after: WindowEstimate) -> bool:

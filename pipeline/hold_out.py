@@ -26,13 +26,14 @@ class HoldOutParameters:
     """What a hold-out check asks for.
 
     Attributes:
-        better: Chance, at most, of scoring so much better than the stored extrinsic where neither is better.
+        better: Chance, at most, of scoring so much better than the stored extrinsic where neither is better:
+            that the mount has moved was decided before, at a far smaller risk.
         agreed: Chance, at least, of differing so much from what the frames themselves say (edges, lines),
             where both mean the same mount.
         least_cells: Cells in which the two extrinsics are compared, at least: Student's t wants some.
     """
 
-    better: float = 1e-3
+    better: float = 0.01
     agreed: float = 1e-3
     least_cells: int = 10
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline import scene_sum, verdict, window
 from pipeline.belief import Belief, believe
+from pipeline.candidate import Proposal, Proposer, moved_since
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, unmeasured
@@ -88,6 +89,7 @@ class Watch:
         self._edge_frames: deque[EdgeFrame] = deque()
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
         self._dating = Dating(mount.camera, parameters.traces)
+        self._proposer = Proposer(mount, parameters)
         self.scenes = scene_sum.begin(mount.expectation(parameters.test))
         self._scene_stamps: deque[int] = deque(maxlen=_SCENE_STAMPS)
         self._begun_m: float | None = None
@@ -105,6 +107,11 @@ class Watch:
         """Way driven at the oldest and newest frame with edges in the window, m; (0, 0) without any."""
         frames = self._edge_frames
         return (frames[0].distance_m, frames[-1].distance_m) if frames else (0.0, 0.0)
+
+    @property
+    def proposal(self) -> Proposal | None:
+        """The extrinsic proposed for a mount that has moved, or why there is none; None while it has not."""
+        return self._proposer.proposal
 
     @property
     def line_stamps(self) -> tuple[int, ...]:
@@ -158,6 +165,7 @@ class Watch:
             judgement = self.belief.judgement
             self.memory = self._dating.redated(self.memory, self.mount, self._expectation(), self.belief)
         self.memory = verdict.finish(self.memory, judgement, self._scout.count, self.mount.required)
+        self._propose(now_ns, ended=True)
 
     def acknowledge(self, now_ns: int, by: str, why: str) -> bool:
         """A person has taken note of the drift: evidence is collected anew; False where none is told."""
@@ -193,6 +201,7 @@ class Watch:
         self._line_frames.clear()
         self._scout.forget()
         self.breaks += 1
+        self._proposer.forget()
         self._judged_ns = None
 
     def _looked_at(self, pair: FramePair, stage: Stage, foresight: Foresight | None) -> Findings:
@@ -262,6 +271,8 @@ class Watch:
         self.memory = self._dating.dated(
             self.memory, self.mount, self._expectation(), self.belief, self._shown_since()
         )
+        with stage("proposal"):
+            self._propose(now_ns)
         return Findings(
             None, findings.cloud, findings.edge_points, findings.masks, findings.lines, judged=True
         )
@@ -296,6 +307,14 @@ class Watch:
             scenes=total.scenes,
             onset=Onset(since_ns, before_ns, since_ns),
         )
+
+    def _propose(self, now_ns: int, *, ended: bool = False) -> None:
+        """Looks for the extrinsic that holds now, where the stored one does not."""
+        assert self.memory is not None  # noqa: S101 - set on entry
+        moved_ns = moved_since(self.memory)
+        frames = tuple(self._edge_frames)
+        lines = tuple(self._line_frames)
+        self._proposer.follow(moved_ns, self.belief, frames, lines, now_ns, ended=ended)
 
     def _shown_since(self) -> int:
         """Stamp from which three quarters of the window's frames are: a drift in all of those would show."""

@@ -27,11 +27,11 @@ SOURCES = ("mount", "clock", "lens")
 Cause: TypeAlias = Literal["mount", "time_offset", "intrinsics_changed", "forward_or_sync", "cause_open"]
 """What the evidence names, closed list.
 
-mount: the mount moved, whatever else did.
+mount: the mount moved, whatever else did, or it explains the evidence as well as the lens.
 time_offset: the clocks alone explain it, far better than the mount or the lens.
 intrinsics_changed: the lens alone explains it, far better than the mount or the clocks.
 forward_or_sync: mount or clocks, each alone explains it: more speeds are wanted.
-cause_open: any other set explains it, or no single one.
+cause_open: clocks or lens explain it, or no single cause does.
 """
 
 CLOCK, LENS = 6, 7
@@ -151,6 +151,9 @@ class Explanation:
             ("clock",): "time_offset",
             ("lens",): "intrinsics_changed",
             ("mount", "clock"): "forward_or_sync",
+            # Mounts move more often than lenses: what only a lens explains as well is held against the mount.
+            ("mount", "lens"): "mount",
+            ("mount", "clock", "lens"): "forward_or_sync",
         }
         fit = tuple(name for name, rival in zip(SOURCES, rivals, strict=True) if rival)
         return named.get(fit, "cause_open")

@@ -189,7 +189,7 @@ def like_a_step(information, range_m, share):
     return W
 
 
-@pytest.mark.parametrize(("share", "named"), [(0.3, "intrinsics_changed"), (1e-9, "cause_open")])
+@pytest.mark.parametrize(("share", "named"), [(0.3, "intrinsics_changed"), (1e-9, "mount")])
 def test_another_focal_length_is_named_where_near_and_far_are_seen(share, named):
     sections = [lensed(a, only(LENS, 0.02), like_a_step(30 * ROAD, 20.0, share)) for a in AT_MANY_SPEEDS]
     found = told(sections)

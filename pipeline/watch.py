@@ -15,6 +15,7 @@ from pipeline.candidate import Proposal, Proposer, moved_since
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, unmeasured
+from pipeline.inquiry import Inquiry
 from pipeline.line_witness import LineFrame
 from pipeline.mount import Mount
 from pipeline.onset import Onset
@@ -90,6 +91,7 @@ class Watch:
         self._line_frames: deque[tuple[int, LineFrame]] = deque()
         self._dating = Dating(mount.camera, parameters.traces)
         self._proposer = Proposer(mount, parameters)
+        self.inquiry = Inquiry(mount, parameters)
         self.scenes = scene_sum.begin(mount.expectation(parameters.test))
         self._scene_stamps: deque[int] = deque(maxlen=_SCENE_STAMPS)
         self._begun_m: float | None = None
@@ -211,9 +213,10 @@ class Watch:
         else:
             evidence = self._scout.look(pair, stage)
         now_ns = pair.image_stamp_ns
-        if evidence.edge_frame is not None:
+        if evidence.edge_frame is not None and evidence.straight is not None:
             self._edge_frames.append(evidence.edge_frame)
             self._dating.see(evidence.edge_frame)
+            self.inquiry.see(now_ns, evidence.straight)
         if evidence.lines is not None:
             self._line_frames.append((now_ns, evidence.lines))
         if evidence.straight is not None:
@@ -259,6 +262,9 @@ class Watch:
         if self.belief is None:
             return findings
         self._sum_scene(self.belief, now_ns)
+        steady = self._steady()
+        with stage("inquiry"):
+            doubt = self._doubt(self.belief, self.memory, steady)
         self.memory = verdict.advance(
             self.memory,
             self.belief.judgement,
@@ -266,7 +272,8 @@ class Watch:
             self.mount.required,
             self.mount.limits,
             self.parameters.verdict,
-            self._steady(),
+            steady,
+            doubt,
         )
         self.memory = self._dating.dated(
             self.memory, self.mount, self._expectation(), self.belief, self._shown_since()
@@ -307,6 +314,15 @@ class Watch:
             scenes=total.scenes,
             onset=Onset(since_ns, before_ns, since_ns),
         )
+
+    def _doubt(
+        self, belief: Belief, memory: verdict.Memory, steady: verdict.Steady | None
+    ) -> verdict.Doubt | None:
+        """What else than the mount may have changed."""
+        judgement = belief.judgement
+        claimed = judgement.alarming or (steady is not None and steady.alarming)
+        stirred = claimed or judgement.suspicious or (steady is not None and steady.suspicious)
+        return self.inquiry.ask(tuple(self._edge_frames), belief, memory, stirred=stirred, claimed=claimed)
 
     def _propose(self, now_ns: int, *, ended: bool = False) -> None:
         """Looks for the extrinsic that holds now, where the stored one does not."""

@@ -27,6 +27,7 @@ from monitor.status import (
 )
 from pipeline import verdict
 from pipeline.belief import Belief
+from pipeline.causes import Explanation
 from pipeline.consequence import consequences
 from pipeline.fusion import Testimony
 from pipeline.mount import Mount
@@ -68,6 +69,7 @@ class Measured:
         rates: Of the inputs.
         timing: Stage -> quantiles.
         outputs_lost: Output -> what happened.
+        explanation: What the drive says of mount, clock and lens, or None.
     """
 
     received: int
@@ -78,6 +80,7 @@ class Measured:
     rates: Rates
     timing: Mapping[str, Timing]
     outputs_lost: Mapping[str, str]
+    explanation: Explanation | None = None
 
 
 def status_of(
@@ -103,9 +106,7 @@ def status_of(
         since_ns=memory.since_ns,
         onset=None
         if onset is None
-        else Onset(
-            stamp_ns=onset.stamp_ns, from_ns=onset.from_ns, to_ns=onset.to_ns, gradual=onset.gradual
-        ),
+        else Onset(stamp_ns=onset.stamp_ns, from_ns=onset.from_ns, to_ns=onset.to_ns, gradual=onset.gradual),
         severity=memory.severity,
         drift=_drift(mount, memory, belief),
         consequence=_consequence(mount, belief),
@@ -119,7 +120,7 @@ def status_of(
         ),
         frames=Frames(received=measured.received, used=measured.used, dropped=dict(measured.dropped)),
         rates=measured.rates,
-        time_offset=TimeOffset(ms=None, sigma_ms=None, separable=False),
+        time_offset=_time_offset(measured.explanation),
         timing_ms=dict(measured.timing),
         extrinsic=identity.extrinsic,
         model=identity.model,
@@ -209,6 +210,19 @@ def _witness(testimony: Testimony, frames: int, chi2: float | None) -> Witness:
 def _values(six: Floats) -> AxisValues:
     people = six * TO_PEOPLE
     return AxisValues(**{name: finite(people[index]) for index, name in enumerate(AXIS_NAMES)})
+
+
+def _time_offset(explanation: Explanation | None) -> TimeOffset:
+    if explanation is None:
+        return TimeOffset(ms=None, sigma_ms=None, separable=False)
+    if not explanation.separable:
+        # What is not told from a moved mount is no offset; its sigma says how little is known.
+        return TimeOffset(ms=None, sigma_ms=finite(1e3 * explanation.time_sigma_s), separable=False)
+    return TimeOffset(
+        ms=finite(1e3 * explanation.time_offset_s),
+        sigma_ms=finite(1e3 * explanation.time_sigma_s),
+        separable=True,
+    )
 
 
 def _matched(belief: Belief | None, label: str) -> int:

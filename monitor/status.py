@@ -215,7 +215,9 @@ class Rates(_Part):
 class TimeOffset(_Part):
     """Offset between the clocks of the two sensors."""
 
-    ms: FiniteFloat | None
+    ms: FiniteFloat | None = Field(
+        description="the camera exposes so much later than its stamp says; null: not told from a drift"
+    )
     sigma_ms: NonNegative | None
     separable: bool = Field(description="the motion allows telling it from yaw and forward drift")
 

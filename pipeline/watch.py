@@ -179,6 +179,7 @@ class Watch:
         self.scenes = scene_sum.begin(self._expectation())
         self._scene_stamps.clear()
         self._begun_m = None
+        self.inquiry.forget()
         self._begun_ns = now_ns
         return True
 

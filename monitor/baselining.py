@@ -231,6 +231,7 @@ class Description:
     Attributes:
         samples: How much road it rests on.
         bias: How well the bias is known.
+        noise: How far a window's stated sigma is honest.
         threshold: What became of the thresholds.
         rows: Per axis bias, its sigma, sigma between scenes, and bound as the test uses them.
         others: Each recording against the others, one clause each.
@@ -238,6 +239,7 @@ class Description:
 
     samples: str
     bias: str
+    noise: str
     threshold: str
     rows: tuple[tuple[float, float, float, float], ...]
     others: tuple[str, ...]
@@ -281,7 +283,9 @@ def described(learned: Learned) -> Description:
         + ", ".join(_sizes(other.difference, [axis]) for axis in range(len(AXIS_NAMES)))
         for other in learned.others
     )
-    return Description(samples, bias, threshold, rows, others)
+    scatter = baseline.scatter
+    noise = f"windows scatter by {scatter.noise:.2f} of their sigma, alike over {scatter.correlation_m:.0f} m"
+    return Description(samples, bias, noise, threshold, rows, others)
 
 
 def _counted(count: int, one: str, many: str = "") -> str:

@@ -69,8 +69,13 @@ class Baseline:
 
     def expectation(self, parameters: DriftTestParameters) -> Expectation:
         """What the test expects of the mount while it has not moved (FORMULAS F2, F5)."""
-        floor = supported_floor(self.spread, parameters.floor(), len(self.stretches))
+        floor = supported_floor(self.spread, parameters.floor(), self._support)
         return Expectation(self.bias, self.covariance, floor, self._bound(parameters.bound()))
+
+    @property
+    def _support(self) -> int:
+        """Stretches that may narrow what holds for any rig: one drive has one weather, load and traffic."""
+        return len(self.stretches) if len({stretch.recording for stretch in self.stretches}) > 1 else 1
 
     def thresholds(self, parameters: DriftTestParameters) -> DriftTestParameters:
         """The test with the alarm of the wanted run length, where the stretches suffice to tell it."""
@@ -80,9 +85,8 @@ class Baseline:
 
     def _bound(self, bound: Floats) -> Floats:
         """b_j (6,): narrowed to what the stretches are sure to keep, widened to what one did not keep."""
-        count = len(self.stretches)
-        if count > 1:
-            bound = np.minimum(bound, tolerance_factor(count) * self.deviation)
+        if self._support > 1:
+            bound = np.minimum(bound, tolerance_factor(self._support) * self.deviation)
         return np.maximum(bound, self.departure)
 
 

@@ -76,6 +76,7 @@ def lines(name: str, learned: "Learned") -> Iterator[str]:
 
     told = described(learned)
     yield f"{name}: {told.samples}: {told.bias}; {told.threshold}"
+    yield f"  {told.noise}"
     for axis, row in zip(AXIS_NAMES, told.rows, strict=True):
         digits = 2 if unit_of(axis) == "deg" else 3
         bias, sigma, scene, bound = row

@@ -214,6 +214,7 @@ def test_healthy_drives_are_described_in_words():
     assert told.samples.startswith("4 recordings, 4 stretches of road (792 m), ")
     assert told.samples.endswith("effective samples")
     assert told.bias.startswith("bias known to 0.0")
+    assert "of their sigma, alike over" in told.noise
     assert "too few for a run length" in told.threshold
     assert "default thresholds stay" in told.threshold
     assert len(told.rows) == 6

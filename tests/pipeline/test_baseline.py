@@ -158,6 +158,17 @@ def test_a_long_drive_is_several_stretches_of_one_recording():
     assert left_out(found.stretches, PARAMETERS) == ()
 
 
+def test_one_drive_alone_narrows_nothing_however_long_it_is():
+    parts = [exact(drive) for drive in simulated(10, 40, spread=1e-3 * FLOOR)]
+    apart = taught(parts).expectation(PARAMETERS)
+    together = taught([dataclasses.replace(part, recording="long") for part in parts])
+    alone = together.expectation(PARAMETERS)
+    assert whitened(alone.floor) == pytest.approx(np.eye(6), abs=1e-6)
+    assert alone.bound == pytest.approx(PARAMETERS.bound())
+    assert np.linalg.eigvalsh(whitened(apart.floor)).max() < 0.6
+    assert (apart.bound < PARAMETERS.bound()).all()
+
+
 def statistics(found: Baseline, scale, seed):
     """Joint statistics of single windows of new streets, as the test forms them."""
     expected = found.expectation(PARAMETERS)

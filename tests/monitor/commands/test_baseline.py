@@ -20,9 +20,10 @@ def test_a_drive_judged_with_its_own_baseline(calibwatch, replayed, cut, tmp_pat
     file = tmp_path / "van.baseline.json"
     code, out, err = calibwatch("baseline", cut(20), "--out", file)
     assert (code, err) == (0, "")
-    first, *rows = out.splitlines()
+    first, noise, *rows = out.splitlines()
     assert first.startswith("camera: 1 recording, 1 stretch of road (")
     assert "one recording tells no run length: default thresholds stay" in first
+    assert noise.startswith("  windows scatter by ")
     assert [row.split()[0] for row in rows[:6]] == ["roll", "pitch", "yaw", "forward", "left", "up"]
     assert rows[6].startswith(f"baseline: {file} (use it: calibwatch replay RECORDING --baseline ")
     part = json.loads(file.read_bytes())["pairs"]["camera"]

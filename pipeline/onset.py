@@ -69,8 +69,8 @@ def change_point(stamps_ns: NDArray[np.int64], scores: Floats, parameters: Onset
         parameters: See there.
 
     Returns:
-        The change with its interval. Where the series may have begun after it, the interval begins with the
-        series, and so does the most likely moment.
+        The change with its interval. Where all of the series may be from after a step, the interval begins
+        with the series, and so does the most likely moment.
     """
     n = len(stamps_ns)
     if n < parameters.least:
@@ -98,7 +98,8 @@ def change_point(stamps_ns: NDArray[np.int64], scores: Floats, parameters: Onset
     else:
         likely = int(np.argmin(jumping))
         stamp = (int(stamps_ns[max(likely - 1, 0)]) + int(stamps_ns[likely])) // 2
-    if int(lowest.min()) < 0 or (gradual and first == 0):
+    if int(lowest.min()) < 0 and not gradual:
+        # Nothing before was surely free of it.
         stamp = int(stamps_ns[0])
     stamp = max(stamp, int(stamps_ns[first]))
     return Onset(stamp, int(stamps_ns[first]), max(stamp, int(stamps_ns[last])), gradual)

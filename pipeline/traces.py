@@ -24,7 +24,7 @@ class TraceParameters:
     """How much of the past is kept.
 
     Attributes:
-        most_frames: Frames: at 10 Hz they reach back some 20 s, half of them into the last two.
+        most_frames: Frames: at 10 Hz they reach back some 15 s, a third of them into the last two.
         most_edges: Edges of each: the way towards a known drift is one number, a third of the edges tells it.
         most_bytes: Gradients of a frame are kept at the finest level that takes no more.
         most_windows: Judgements: at one a second they reach back some days.
@@ -59,7 +59,7 @@ class WindowTrace:
 
 
 def spread(stamps_ns: Sequence[int], most: int) -> list[int]:
-    """Indices of ascending stamps that stay: the newest densely, one per eighth of the age further back.
+    """Indices of ascending stamps that stay: the newest densely, one per sixteenth of the age further back.
 
     Slots of time are fixed, each made of two of half its length, so that what stays now was kept before.
     """
@@ -75,8 +75,8 @@ def spread(stamps_ns: Sequence[int], most: int) -> list[int]:
     return kept[-most:]
 
 
-_SHARE_BITS = 3
-"""An eighth of the age."""
+_SHARE_BITS = 4
+"""A sixteenth of the age."""
 
 
 def thinned(frame: EdgeFrame, parameters: TraceParameters) -> EdgeFrame:

@@ -30,7 +30,7 @@ from pipeline.mount import Mount
 from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, Floats, FramePair, PointCloud, read_only
-from pipeline.rings import sensor_origin
+from pipeline.rings import SensorSeat, sensor_seat
 from pipeline.segmentation import Segmenter, grid_scale
 
 
@@ -183,7 +183,7 @@ class Calibrator:
         self._segmenter = segmenter
         self._settings = settings
         self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
-        self._origin: Floats | None = None
+        self._seat: SensorSeat | None = None
         self._kept: list[_Kept] = []
         self._stride = 1
 
@@ -198,9 +198,9 @@ class Calibrator:
         if dropped is not None:
             self.dropped[dropped] += 1
             return dropped
-        if self._origin is None:
+        if self._seat is None:
             # Of the sweep as it was measured: straightening bends its rings.
-            self._origin = sensor_origin(pair.cloud)
+            self._seat = sensor_seat(pair.cloud)
         with stage("motion"):
             straight = self._ego.straighten(pair)
         if self.frames % self._stride == 0:
@@ -233,7 +233,9 @@ class Calibrator:
         return None
 
     def _edges(self, cloud: PointCloud, ground: Ground | None, T_cam_lidar: Floats) -> Edges | None:
-        return find_edges(cloud, ground, self.mount.camera, T_cam_lidar, self._parameters.edges, self._origin)
+        seat, settings = self._seat, self._parameters.edges
+        origin, axis = (None, None) if seat is None else (seat.origin, seat.axis)
+        return find_edges(cloud, ground, self.mount.camera, T_cam_lidar, settings, origin, axis)
 
     def finish(self, stage: Stage = _unmeasured) -> Calibrated:
         """Solves all frames."""
@@ -270,9 +272,10 @@ class Calibrator:
             scale = grid_scale(*kept.image.size)
             masks = masks_from_probabilities(probabilities, pixels, self._parameters.masks, horizon, scale)
             seen = in_view(kept.cloud, mount.camera, T_best)
+            origin = None if self._seat is None else self._seat.origin
             lines = [
-                *find_lanes(kept.cloud, kept.ground, seen, rng, origin=self._origin),
-                *find_poles(kept.cloud, kept.ground, seen, origin=self._origin),
+                *find_lanes(kept.cloud, kept.ground, seen, rng, origin=origin),
+                *find_poles(kept.cloud, kept.ground, seen, origin=origin),
             ]
             frames.append(judged_frame(kept.cloud, lines, masks, mount.camera))
         return LineJudge(tuple(frames), mount.camera)

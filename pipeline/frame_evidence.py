@@ -22,8 +22,8 @@ from pipeline.line_witness import LineFrame
 from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
-from pipeline.records import Floats, FramePair, Masks, PointCloud
-from pipeline.rings import sensor_origin
+from pipeline.records import FramePair, Masks, PointCloud
+from pipeline.rings import SensorSeat, sensor_seat
 from pipeline.segmentation import Segmenter, grid_scale
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
@@ -86,7 +86,7 @@ class Scout:
         self._parameters = parameters
         self._segmenter = segmenter
         self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
-        self._origin: Floats | None = None
+        self._seat: SensorSeat | None = None
         self._lines_at: tuple[int, float] | None = None
         self._count = 0
 
@@ -115,18 +115,18 @@ class Scout:
             return FrameEvidence("empty_cloud", pair.cloud, nothing)
         self._count += 1
         rng = np.random.default_rng([self._parameters.seed, self._count])
-        if self._origin is None:
+        if self._seat is None:
             # Of the sweep as it was measured: straightening bends its rings.
-            self._origin = sensor_origin(pair.cloud)
+            self._seat = sensor_seat(pair.cloud)
         with stage("motion"):
             straight = self._ego.straighten(pair)
         pair = dataclasses.replace(pair, cloud=straight.cloud)
         with stage("ground"):
             ground = fit_ground(pair.cloud, mount.up, rng)
         with stage("edges"):
-            edges = find_edges(
-                pair.cloud, ground, mount.camera, mount.T_cam_lidar, self._parameters.edges, self._origin
-            )
+            seat, settings = self._seat, self._parameters.edges
+            T = mount.T_cam_lidar
+            edges = find_edges(pair.cloud, ground, mount.camera, T, settings, seat.origin, seat.axis)
         masks, lines = None, None
         if self._lines_due(pair.image_stamp_ns, straight):
             masks, lines = self._lines_of(pair, ground, rng, stage)
@@ -192,6 +192,6 @@ class Scout:
                 forward=mount.forward,
                 rng=rng,
                 ground=ground,
-                origin=self._origin,
+                origin=None if self._seat is None else self._seat.origin,
             )
         return masks, lines

@@ -99,12 +99,15 @@ figures-crlf: env
 	$(BIN)/python docs/crlf_page.py $(OUT)/crlf docs
 
 # Runs that were finished stand in $(OUT)/drift and are not run again: remove it after a change of the watch.
-# An hour or two of an idle core for the simulated drives, as much for each of the recordings.
+# Some hours of an idle core: ten seconds a run.
 DRIVES ?= $(wildcard $(addprefix $(CALIBWATCH_DATA)/,kitti_raw_0009_a kitti_raw_sfnd kitti_raw_0005_a kitti_odom_03_a))
 figures-drift: env
 	$(BIN)/calibwatch evaluate drift --simulated 4 --runs 6 --out $(OUT)/drift/simulated
-	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --limits 0.5 0.1 --out $(OUT)/drift/limits)
-	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --kinds healthy,combined --out $(OUT)/drift/recorded)
+	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --baseline other --limits 0.5 0.1 \
+		--kinds healthy,combined,single,compensating,offline --out $(OUT)/drift/limits)
+	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --baseline other --kinds healthy,combined --out $(OUT)/drift/usual)
+	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --limits 0.5 0.1 --kinds healthy,combined,single \
+		--out $(OUT)/drift/alone)
 	$(BIN)/python docs/drift_page.py $(OUT)/drift docs
 
 clean:

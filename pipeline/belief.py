@@ -96,6 +96,7 @@ def believe(
         loss=np.inf if edges is None else edges.loss,
         contrast=np.inf if edges is None else edges.contrast,
         peak=np.inf if edges is None else edges.peak,
+        preference=np.inf if edges is None else edges.preference,
         persistent=edges is None or min(edges.block_gains, default=0.0) > 0.0,
         frames=len(edge_frames),
         contradicted=contradicted,

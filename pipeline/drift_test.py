@@ -30,6 +30,9 @@ class DriftTestParameters:
         least_loss: Share of the best score that must be lost when the stored extrinsic may only move inside
             the floor: half as much again as the largest of 300 healthy windows on four drives (PROBE 5).
         suspicious_loss: Loss that is suspicious whatever the joint statistic says.
+        least_preference: Standard errors by which the cells of the image, one by one, prefer the estimate to
+            what only the floor explains: on simulated country roads false modes that a few dense objects
+            prefer reach 0.5, at a loss of up to 0.1 and statistics of hundreds; drifts reach 2 to 8.
         least_contrast: Score at the estimate over chance, minus 1, below which image and cloud show nothing
             in common: three frames with nothing to say lay below 0.09, all others above 0.25 (PROBE 9).
         least_peak: Height of the maximum over chance, in sigma of the score at random extrinsics, below which
@@ -54,6 +57,7 @@ class DriftTestParameters:
     suspicion: float = 22.46
     least_loss: float = 0.03
     suspicious_loss: float = 0.10
+    least_preference: float = 2.0
     least_contrast: float = 0.15
     least_peak: float = 3.7
     K_fa: float = 4.417
@@ -96,6 +100,8 @@ class Evidence:
         loss: Share of the best score lost when only the floor may explain it (inf where no score exists).
         contrast: Score at the estimate over chance, minus 1.
         peak: Height of that score over chance, in sigma (inf where no score exists).
+        preference: How clearly the cells of the image prefer the estimate to what only the floor explains,
+            standard errors (inf where no score exists).
         persistent: Whether each part of the window by itself prefers the estimate.
         frames: Frames in the window.
         contradicted: Whether the two witnesses differ by more than their errors allow.
@@ -108,6 +114,7 @@ class Evidence:
     loss: float
     contrast: float
     peak: float
+    preference: float
     persistent: bool
     frames: int
     contradicted: bool = False
@@ -227,7 +234,8 @@ def judge(
     bound = expectation.bound + 2.0 * np.abs(evidence.feigned)
     protection = (parameters.K_fa + parameters.K_md) * sigma + bound
     seen = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
-    convincing = evidence.loss > parameters.least_loss and evidence.persistent and seen
+    preferred = evidence.preference > parameters.least_preference
+    convincing = evidence.loss > parameters.least_loss and preferred and evidence.persistent and seen
     # Without edges there is no score to lose: lines are judged by the joint statistic alone.
     lost = parameters.suspicious_loss < evidence.loss < math.inf
     return Judgement(

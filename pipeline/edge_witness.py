@@ -21,6 +21,7 @@ from pipeline.edge_score import (
     batch_of,
     curvatures,
     mean_responses,
+    preference,
     score,
     score_and_gradient,
     score_only,
@@ -101,6 +102,8 @@ class EdgeSolution:
         peak: Height of the maximum over chance, in standard deviations of the score at random extrinsics.
         loss: Share of the best score that is lost if the stored extrinsic may move inside the floor only (G
             of PROBE 5).
+        preference: How clearly the cells of the image prefer the maximum to the best point inside the floor,
+            standard errors (:func:`edge_score.preference`).
         block_gains: For each third of the window in time, its own score at the maximum over that at the best
             point inside the floor, minus 1.
         edges: Number of edges.
@@ -115,6 +118,7 @@ class EdgeSolution:
     contrast: float
     peak: float
     loss: float
+    preference: float
     block_gains: tuple[float, ...]
     edges: int
     frames: int
@@ -166,6 +170,7 @@ def solve(
         contrast=best / background - 1.0 if background > 0 else 0.0,
         peak=(best - background) / spread if spread > 0 else 0.0,
         loss=max(0.0, 1.0 - float(at_inside.sum() / at_best.sum()) + penalty) if best > 0 else 0.0,
+        preference=preference(batch, at_best, at_inside),
         block_gains=_block_gains(batch.slot, at_best, at_inside),
         edges=len(batch),
         frames=len(batch.stamps_ns),

@@ -11,6 +11,7 @@ from monitor.statements import Identity, Measured, status_of
 from monitor.status import AXIS_NAMES, Provenance, Rates
 from pipeline import fusion, verdict
 from pipeline.belief import Belief
+from pipeline.causes import Explanation
 from pipeline.drift_test import Evidence, Judgement
 from pipeline.mount import Mount
 from pipeline.records import CameraModel
@@ -29,7 +30,7 @@ MOUNT = Mount(
 )
 
 
-def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT):
+def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None):
     rates = Rates(lidar_hz=None, camera_hz=None, gap_ms=None)
     measured = Measured(
         received=7,
@@ -40,6 +41,7 @@ def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT):
         rates=rates,
         timing={},
         outputs_lost={"report": "the disk is full"},
+        explanation=explanation,
     )
     identity = Identity("van-1", "front", NONE, NONE, "calibwatch test")
     return status_of(identity, mount, verdict.start(5), belief, measured, 3, 9)
@@ -64,7 +66,7 @@ def judged():
     )
     testimony = fusion.Testimony(DRIFT, np.diag(np.full(6, 100.0)))
     evidence = Evidence(
-        DRIFT, np.diag(np.where(known, 0.01, 10.0) ** 2), 0.1, 1.0, 9.0, persistent=True, frames=9
+        DRIFT, np.diag(np.where(known, 0.01, 10.0) ** 2), 0.1, 1.0, 9.0, 4.0, persistent=True, frames=9
     )
     return Belief(judgement, evidence, np.eye(4), None, None, testimony, None, ())
 
@@ -116,3 +118,24 @@ def test_what_the_drift_does_is_told_at_every_distance_and_not_of_chance():
     belief = judged()
     blind = dataclasses.replace(belief, judgement=dataclasses.replace(belief.judgement, blind=True))
     assert said().consequence == said(blind).consequence == ()
+
+
+def test_a_time_offset_is_told_where_it_is_no_drift():
+    explanation = Explanation(
+        time_offset_s=0.0123,
+        time_sigma_s=0.002,
+        time_alone_s=0.01,
+        separable=True,
+        zoom=0.0,
+        zoom_sigma=0.001,
+        motion=np.zeros(6),
+        needed=np.zeros(3),
+        alone=np.zeros(3),
+        unexplained=0.0,
+        sections=4,
+    )
+    offset = said(explanation=explanation).time_offset
+    assert offset.model_dump() == pytest.approx({"ms": 12.3, "sigma_ms": 2.0, "separable": True})
+    hidden = said(explanation=dataclasses.replace(explanation, separable=False)).time_offset
+    assert hidden.model_dump() == pytest.approx({"ms": None, "sigma_ms": 2.0, "separable": False})
+    assert said().time_offset.sigma_ms is None

@@ -20,7 +20,14 @@ SURE = np.diag([math.radians(0.02) ** 2] * 3 + [0.005**2] * 3)
 
 def evidence(drift=None, covariance=SURE, **changes):
     """Evidence of a good window that lost much of its score, unless told otherwise."""
-    stated = {"loss": 0.2, "contrast": 0.8, "peak": 10.0, "persistent": True, "frames": 20} | changes
+    stated = {
+        "loss": 0.2,
+        "contrast": 0.8,
+        "peak": 10.0,
+        "preference": 4.0,
+        "persistent": True,
+        "frames": 20,
+    } | changes
     return Evidence(np.zeros(6) if drift is None else np.asarray(drift, float), covariance, **stated)
 
 
@@ -140,6 +147,7 @@ def test_healthy_windows_alarm_at_the_stated_risk():
         ({"loss": 0.029}, False, True),
         ({"loss": 0.031}, True, True),
         ({"persistent": False}, False, True),
+        ({"preference": 1.9}, False, True),
         ({"contrast": 0.14}, False, False),
         ({"contrast": 0.16}, True, True),
         ({"peak": 3.6}, False, False),

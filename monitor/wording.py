@@ -34,6 +34,25 @@ NEXT_STEPS: dict[State, str] = {
 """What to do next, by state; words between backticks are commands."""
 
 
+OTHER_CAUSES: dict[str, str] = {
+    "time_offset": "Sweeps and images do not belong together in time. Check how their stamps come about "
+    "(trigger, exposure, driver, clock synchronisation); `calibwatch inspect` lists rates and gaps. What the "
+    "watch says of the mount holds once they agree.",
+    "intrinsics_changed": "Check that the intrinsics are those of this camera, lens and image size (another "
+    "crop, scale, focus or zoom), or measure them anew. What the watch says of the mount holds once they agree.",
+    "forward_or_sync": "Drive at other speeds, or stop for some seconds: what stays when the vehicle stands is "
+    "the mount, what goes is time. `calibwatch inspect` lists the gaps between the stamps.",
+    "cause_open": "Check the stamps of both sensors, the intrinsics and the mount; driving at other speeds and "
+    "past things near and far tells them apart. `calibwatch inspect` shows what the inputs say of themselves.",
+}
+"""Codes of a suspicion that something else than the mount has changed, and what to do next."""
+
+
+def next_step(status: Status) -> str:
+    """What to do next; words between backticks are commands."""
+    return OTHER_CAUSES.get(status.code, NEXT_STEPS[status.state])
+
+
 def stamp_text(stamp_ns: int) -> str:
     """A stamp as UTC to the second's tenth, or as seconds where the clock did not start in 1970."""
     if not _FIRST_DATE_NS <= stamp_ns <= _LAST_DATE_NS:
@@ -102,11 +121,14 @@ def verdict_sentence(status: Status) -> str:
     axes = [axis_text(name, axis) for name, axis in status.drift.items() if axis.monitored]
     watched = ", ".join(axes) or "no axis"
     since = stamp_text(status.since_ns)
+    suspected = f"{moved or 'the evidence'} is not yet sure"
+    if status.code in OTHER_CAUSES:
+        suspected = _clause(status.reason)
     bodies: dict[State, str] = {
         "healthy": f"healthy since {since}: a drift beyond the limits is excluded for {watched}",
         "drifted": f"drifted ({status.severity or 'minor'}): {moved}, {_onset_text(status)}"
         f"{consequence_text(status)}",
-        "suspect": f"suspect since {since}: {moved or 'the evidence'} is not yet sure",
+        "suspect": f"suspect since {since}: {suspected}",
         "unobservable": f"without a statement since {since}: {_clause(status.reason)}",
         "stale": f"stale since {since}: {_clause(status.reason)}",
         "fault": f"not being watched since {since}: {_clause(status.reason)}",

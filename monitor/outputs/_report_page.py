@@ -10,8 +10,17 @@ from monitor.events import EndEvent
 from monitor.outputs._history import Change
 from monitor.outputs._overlays import Crop, Overlay
 from monitor.outputs._series import Sample
-from monitor.status import AXIS_NAMES, AxisDrift, AxisName, Status, Witness, first_in_precedence, unit_of
-from monitor.wording import NEXT_STEPS, moved_axes, size_text, span_text, stamp_text, verdict_sentence
+from monitor.status import (
+    AXIS_NAMES,
+    AxisDrift,
+    AxisName,
+    Status,
+    TimeOffset,
+    Witness,
+    first_in_precedence,
+    unit_of,
+)
+from monitor.wording import moved_axes, next_step, size_text, span_text, stamp_text, verdict_sentence
 
 _MOST_CHANGES_SHOWN = 60
 """rows of the table of states; the first and the last half of them are shown."""
@@ -99,7 +108,7 @@ def _pair(index: int, pair: PairMaterial) -> dict[str, Any]:
         "name": status.pair,
         "state": status.state,
         "sentence": verdict_sentence(status),
-        "next_step": _with_commands(NEXT_STEPS[status.state]),
+        "next_step": _with_commands(next_step(status)),
         "signs": f"{_SIGNS[status.drift.axes]}, {_RELATIVE[status.drift.relative_to]}. Signs: +yaw turns "
         "left, +pitch nose down, +roll right side down; forward, left and up are those of the camera centre.",
         "strip": _strip(pair),
@@ -279,7 +288,7 @@ def _tables(status: Status) -> list[dict[str, Any]]:
                 ("LiDAR", _figure(rates.lidar_hz, "Hz")),
                 ("camera", _figure(rates.camera_hz, "Hz")),
                 ("image after sweep", _figure(rates.gap_ms, "ms")),
-                ("time offset", _figure(offset.ms, "ms") if offset.separable else "not separable"),
+                ("time offset", _offset_text(offset)),
                 ("masks and lines on", _figure(rates.lines_hz, "Hz")),
                 ("edges on", _figure(rates.edges_hz, "Hz")),
             ],
@@ -341,6 +350,13 @@ def _provenance(digest: str | None, version: str | None) -> str:
 
 def _figure(value: float | None, unit: str) -> str:
     return "unknown" if value is None else f"{value:.1f} {unit}".rstrip()
+
+
+def _offset_text(offset: TimeOffset) -> str:
+    """The time offset with its sigma, or that it is not told from a moved mount."""
+    if offset.ms is None or offset.sigma_ms is None:
+        return "not told from a forward drift"
+    return f"{offset.ms:+.1f} ms (sigma {offset.sigma_ms:.1f} ms)"
 
 
 def _data_url(jpeg: bytes) -> str:

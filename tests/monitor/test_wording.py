@@ -5,13 +5,16 @@ from hypothesis import strategies as st
 from monitor.status import STATES, Status
 from monitor.wording import (
     NEXT_STEPS,
+    OTHER_CAUSES,
     moved_axes,
+    next_step,
     size_text,
     span_text,
     stamp_text,
     unchecked_text,
     verdict_sentence,
 )
+from pipeline.verdict import CODES
 
 NOON = 1_317_042_145_000_000_000
 
@@ -170,9 +173,26 @@ def test_a_span_tells_what_both_share_once():
     assert span_text(NOON, NOON + day) == "2011-09-26 13:02:25.0 UTC and 2011-09-27 13:02:25.0 UTC"
 
 
+@pytest.mark.parametrize("code", OTHER_CAUSES)
+def test_another_cause_is_told_by_its_reason_and_has_a_step_of_its_own(code):
+    assert CODES[code] == "suspect"
+    doubted = status("suspect", {"forward": {"value": 0.4}}, code=code, reason="Images come 30 ms late.")
+    assert ": images come 30 ms late" in verdict_sentence(doubted)
+    assert "forward +0.4" not in verdict_sentence(doubted)
+    assert next_step(doubted) == OTHER_CAUSES[code] != NEXT_STEPS["suspect"]
+
+
+def test_any_other_suspicion_asks_for_more_evidence():
+    doubted = status("suspect", {"forward": {"value": 0.4}}, code="evidence_of_drift")
+    assert "forward +0.4" in verdict_sentence(doubted)
+    assert next_step(doubted) == NEXT_STEPS["suspect"]
+
+
 def test_commands_that_are_named_exist():
     known = {"baseline", "calibrate", "extrinsic", "inspect", "config"}
-    named = [text for step in NEXT_STEPS.values() for text in step.split("`")[1::2]]
+    named = [
+        text for step in (*NEXT_STEPS.values(), *OTHER_CAUSES.values()) for text in step.split("`")[1::2]
+    ]
     assert {text.split()[1] for text in named} <= known
     assert all(text.startswith("calibwatch ") for text in named)
 

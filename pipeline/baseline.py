@@ -104,13 +104,13 @@ def supported_floor(spread: Floats, floor: Floats, count: int) -> Floats:
     """The floor (6,6) that ``count`` stretches support in place of the one for any rig.
 
     Direction by direction, in units of that floor: wider where the stretches spread more; narrower only as
-    far as the upper limit of their spread, with the floor's own scenes counted in.
+    far as the upper limit of their spread, with the floor's own scenes counted in. One alone narrows nothing.
     """
     root = np.linalg.cholesky(floor)
     whitened = np.linalg.solve(root, np.linalg.solve(root, spread).T)
     values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
     degrees = PRIOR_SCENES + count - 1.0
-    upper = values * degrees / float(special.chdtri(degrees, _CONFIDENCE))
+    upper = values * degrees / float(special.chdtri(degrees, _CONFIDENCE)) if count > 1 else 1.0
     values = np.where(values < 1.0, np.minimum(upper, 1.0), values)
     scaled = root @ vectors
     return np.asarray((scaled * values) @ scaled.T, dtype=np.float64)

@@ -39,11 +39,12 @@ OTHER_CAUSES: dict[str, str] = {
     "(trigger, exposure, driver, clock synchronisation); `calibwatch inspect` lists rates and gaps. What the "
     "watch says of the mount holds once they agree.",
     "intrinsics_changed": "Check that the intrinsics are those of this camera, lens and image size (another "
-    "crop, scale, focus or zoom), or measure them anew. What the watch says of the mount holds once they agree.",
-    "forward_or_sync": "Drive at other speeds, or stop for some seconds: what stays when the vehicle stands is "
-    "the mount, what goes is time. `calibwatch inspect` lists the gaps between the stamps.",
-    "cause_open": "Check the stamps of both sensors, the intrinsics and the mount; driving at other speeds and "
-    "past things near and far tells them apart. `calibwatch inspect` shows what the inputs say of themselves.",
+    "crop, scale, focus or zoom), or measure them anew. What the watch says of the mount holds once they "
+    "agree.",
+    "forward_or_sync": "Drive at other speeds, or stop for some seconds: what stays when the vehicle stands "
+    "is the mount, what goes is time. `calibwatch inspect` lists the gaps between the stamps.",
+    "cause_open": "Check the stamps of both sensors, the intrinsics and the mount; driving at other speeds "
+    "and past things near and far tells them apart. `calibwatch inspect` shows what the inputs say.",
 }
 """Codes of a suspicion that something else than the mount has changed, and what to do next."""
 

@@ -3,6 +3,7 @@
 import hashlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from importlib import metadata
 
@@ -12,8 +13,10 @@ from monitor.clock import Clock
 from monitor.engine import Engine
 from monitor.events import EndEvent, Event
 from monitor.intake import Intake
+from monitor.lookahead import Forerunner, arrivals
 from monitor.messages import Message
 from monitor.outputs import Outputs
+from monitor.parts import Parts, parts_of
 from monitor.refusal import Account, drop_notes, refuse_unusable
 from monitor.requests import Requests
 from monitor.rig import Rig, RigPair
@@ -23,6 +26,7 @@ from monitor.status import Provenance, State, first_in_precedence
 from pipeline.errors import RigError
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
+from pipeline.records import FramePair
 from pipeline.segmentation import Segmenter
 from pipeline.watch import Watch
 
@@ -49,6 +53,8 @@ class Watching:
         engines: One per pair, by name.
         outputs: Tell the world.
         tell: Told at once, one sentence each, what people should know of the inputs and the outputs.
+        clock: Measures what stages cost.
+        lidars: Topic of each pair's LiDAR.
         requests: What people ask of it meanwhile.
     """
 
@@ -56,6 +62,8 @@ class Watching:
     engines: dict[str, Engine]
     outputs: Outputs
     tell: Callable[[str], None]
+    clock: Clock
+    lidars: dict[str, str]
     requests: Requests = field(default_factory=Requests)
 
 
@@ -86,7 +94,8 @@ def watching(
             software=software(),
         )
         engines[pair.name] = Engine(identity, Watch(mount, parameters, segmenter), intake, clock)
-    return Watching(intake, engines, outputs, tell)
+    lidars = {pair.name: pair.lidar.topic or "" for pair in rig.pairs}
+    return Watching(intake, engines, outputs, tell, clock, lidars)
 
 
 def mount_of(pair: RigPair) -> Mount:
@@ -113,6 +122,7 @@ def watch(
     losses: Losses,
     stop: threading.Event,
     progress: Callable[[int], None] | None = None,
+    ahead: int = 0,
 ) -> State:
     """Drives a stream of messages through the engines until it ends or ``stop`` is set.
 
@@ -122,6 +132,8 @@ def watch(
         losses: What the source could not give, told at the end.
         stop: Ends the run early: what was written says that it is not complete.
         progress: Told the number of pairs after each one.
+        ahead: So many pairs are read before the first of them is judged, and looked at meanwhile in a thread
+            of their own. 0 for a source that goes on by itself: what came is then judged at once.
 
     Returns:
         The state at the end, the first in precedence over the pairs.
@@ -131,7 +143,12 @@ def watch(
     """
     for engine in watching_.engines.values():
         engine.attach(losses, lambda: watching_.outputs.losses)
-    arrival_ns = _feed(watching_, messages, stop, progress)
+    if ahead > 0:
+        watches = {name: engine.watch for name, engine in watching_.engines.items()}
+        with closing(Forerunner(watches, watching_.clock)) as forerunner:
+            arrival_ns = _feed(watching_, messages, stop, progress, (ahead, forerunner))
+    else:
+        arrival_ns = _feed(watching_, messages, stop, progress, None)
     interrupted = stop.is_set()
     if not interrupted:
         for pair in watching_.intake.flush():
@@ -143,7 +160,8 @@ def watch(
     lost = [f"output lost: {name}: {why}" for name, why in watching_.outputs.losses.items()]
     drops = drop_notes(_accounts(watching_), watching_.intake)
     warnings = (*losses.notes, *watching_.intake.notes, *drops, *lost)
-    _tell(watching_, [EndEvent(complete=not interrupted, note=note, warnings=warnings)])
+    parts = _parts(watching_)
+    _tell(watching_, [EndEvent(complete=not interrupted, note=note, warnings=warnings, parts=parts)])
     memories = [engine.watch.memory for engine in watching_.engines.values()]
     return first_in_precedence(memory.state for memory in memories if memory is not None)
 
@@ -153,26 +171,39 @@ def _feed(
     messages: Iterable[Message | Tick],
     stop: threading.Event,
     progress: Callable[[int], None] | None,
+    ahead: tuple[int, Forerunner] | None,
 ) -> int:
     """Until the messages end or ``stop`` is set; gives the time of the last one, ns."""
     intake, engines = watching_.intake, watching_.engines
+    most, see = (0, _unseen) if ahead is None else (ahead[0], ahead[1].see)
     pairs, arrival_ns, told = 0, 0, 0
-    for item in messages:
+    for arrival in arrivals(messages, intake, most, see):
         if stop.is_set():
-            break
+            return arrival_ns
+        item = arrival.item
+        intake.show(arrival.accounts)
         arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
-        for pair in intake.take(item) if isinstance(item, Message) else ():
+        for pair in arrival.pairs:
             pairs += 1
-            _tell(watching_, engines[pair.pair].step(pair, arrival_ns))
+            found = None if ahead is None else ahead[1].take(pair)
+            _tell(watching_, engines[pair.pair].step(pair, arrival_ns, found))
+            if ahead is not None:
+                ahead[1].settle(pair.pair)
             if progress is not None:
                 progress(pairs)
         for engine in engines.values():
             _tell(watching_, engine.tick(arrival_ns))
         _heed(watching_)
-        for note in intake.notes[told:]:
+        for note in intake.notes[told : arrival.notes]:
             watching_.tell(note)
-        told = len(intake.notes)
+        told = arrival.notes
+    intake.show(None)
     return arrival_ns
+
+
+def _unseen(pair: FramePair) -> None:
+    """Nobody looks ahead."""
+    del pair
 
 
 def _heed(watching_: Watching) -> None:
@@ -196,6 +227,15 @@ def _tell(watching_: Watching, events: Sequence[Event]) -> None:
         outputs.handle(event)
     for name in set(outputs.losses) - before:
         watching_.tell(f"output lost: {name}: {outputs.losses[name]}")
+
+
+def _parts(watching_: Watching) -> tuple[Parts, ...]:
+    """Which part of the rig has moved, where some pair has drifted and others share its LiDAR."""
+    watches = {name: engine.watch for name, engine in watching_.engines.items()}
+    if not any(watch.memory is not None and watch.memory.severity is not None for watch in watches.values()):
+        return ()
+    watched = {name: (watch.mount, watch.belief) for name, watch in watches.items()}
+    return parts_of(watched, watching_.lidars, next(iter(watches.values())).parameters)
 
 
 def _accounts(watching_: Watching) -> list[Account]:

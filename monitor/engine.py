@@ -6,12 +6,15 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from monitor.candidate_file import document_of
 from monitor.clock import Clock
-from monitor.events import Event, FrameEvent, StatusEvent
+from monitor.events import Event, FrameEvent, ProposalEvent, StatusEvent
 from monitor.intake import Intake
+from monitor.lookahead import Ahead
 from monitor.sources import Losses
 from monitor.statements import Identity, Measured, status_of
 from monitor.status import Rates, Timing
+from pipeline.candidate import Candidate, Proposal
 from pipeline.records import FramePair
 from pipeline.watch import Findings, Watch
 
@@ -68,6 +71,7 @@ class Engine:
         self._refused_before: Counter[str] = Counter()
         self._losses = Losses()
         self._outputs_lost: Callable[[], Mapping[str, str]] = dict
+        self._proposal: Proposal | None = None
 
     @property
     def used(self) -> int:
@@ -84,12 +88,13 @@ class Engine:
         self._losses = losses
         self._outputs_lost = outputs_lost
 
-    def step(self, pair: FramePair, arrival_ns: int) -> list[Event]:
+    def step(self, pair: FramePair, arrival_ns: int, ahead: Ahead | None = None) -> list[Event]:
         """Takes a pair in: what was seen in it, and the status where one is due.
 
         Args:
             pair: A sweep and its image.
             arrival_ns: When the message that completed it came, on the clock of the source.
+            ahead: What was found in it before its turn.
         """
         if not self._paired:
             # What was told before it bears stamps of the source's clock, which need not be the data's.
@@ -99,7 +104,10 @@ class Engine:
         self._cloud_ns.append(pair.cloud_stamp_ns)
         self._image_ns.append(pair.image_stamp_ns)
         with self._stage("frame"):
-            findings = self.watch.step(pair, self._stage)
+            findings = self.watch.step(pair, self._stage, None if ahead is None else ahead.foresight)
+        for name, spent_ms in () if ahead is None else ahead.spent:
+            self._spent(name, spent_ms)
+            self._timing["frame"][-1] += spent_ms
         if findings.dropped == "image_size":
             self.wrong_size = pair.image.size
         if findings.dropped is not None:
@@ -108,7 +116,7 @@ class Engine:
             return self._due()
         self._used += 2
         self._refused_before = self._refused()
-        return [self._frame_event(pair, findings), *self._due()]
+        return [self._frame_event(pair, findings), *self._due(), *self._proposed()]
 
     def tick(self, arrival_ns: int) -> list[Event]:
         """No pair came until ``arrival_ns`` of the source's clock: stamps are taken to run on."""
@@ -139,12 +147,24 @@ class Engine:
 
     def acknowledge(self, by: str, why: str) -> list[Event]:
         """A person takes note of the drift: the status after it; nothing where no drift is told."""
-        return [self._status()] if self.watch.acknowledge(self._now_ns, by, why) else []
+        return [self._status(), *self._proposed()] if self.watch.acknowledge(self._now_ns, by, why) else []
 
     def finish(self) -> list[Event]:
         """The input has ended: the last status."""
         self.watch.finish(self._now_ns)
-        return [self._status()]
+        return [self._status(), *self._proposed()]
+
+    def _proposed(self) -> list[Event]:
+        """What is proposed for a mount that has moved, where that has changed."""
+        proposal = self.watch.proposal
+        if proposal is self._proposal:
+            return []
+        self._proposal = proposal
+        pair = self.identity.pair
+        if isinstance(proposal, Candidate):
+            return [ProposalEvent(pair, document_of(self.identity, self.watch.mount, proposal))]
+        reason = "No drift stands any more." if proposal is None else proposal.reason
+        return [ProposalEvent(pair, None, reason)]
 
     def _due(self) -> list[Event]:
         memory = self.watch.memory
@@ -216,8 +236,10 @@ class Engine:
         try:
             yield
         finally:
-            spent = (self._clock.monotonic_ns() - begun) / 1e6
-            self._timing.setdefault(name, deque(maxlen=_TIMINGS)).append(spent)
+            self._spent(name, (self._clock.monotonic_ns() - begun) / 1e6)
+
+    def _spent(self, name: str, spent_ms: float) -> None:
+        self._timing.setdefault(name, deque(maxlen=_TIMINGS)).append(spent_ms)
 
 
 def _rate(stamps: deque[int] | tuple[int, ...]) -> float | None:

@@ -2,14 +2,18 @@
 
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from monitor.messages import Decoded, Message, decode
 from monitor.rig import Rig, RigPair
 from monitor.sync import Paired, Pairer, Side, middle_ns, pairer_for
 from pipeline.errors import InputError
 from pipeline.records import CameraImage, FramePair, PointCloud
+
+Accounts: TypeAlias = Mapping[str, tuple[int, Counter[str]]]
+"""For each pair the frames that came, and those dropped before they became a pair, by reason."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,15 +48,20 @@ class Intake:
     def __init__(self, rig: Rig) -> None:
         self._lanes = [_Lane(pair, pairer_for(pair), Counter()) for pair in rig.pairs]
         self._told: set[tuple[str, str]] = set()
+        self._shown: Accounts | None = None
         self.notes: list[str] = []
 
     def account(self, pair: str) -> tuple[int, Counter[str]]:
         """Frames (sweeps and images) that came for a pair, and what was dropped before it became a pair."""
-        lane = self._lane(pair)
-        dropped = Counter(lane.dropped)
-        for (_, reason), number in lane.pairer.dropped.items():
-            dropped[reason] += number
-        return lane.received, +dropped
+        return self._account(self._lane(pair)) if self._shown is None else self._shown[pair]
+
+    def accounts(self) -> Accounts:
+        """The accounts of all pairs up to the last message."""
+        return {lane.pair.name: self._account(lane) for lane in self._lanes}
+
+    def show(self, accounts: Accounts | None) -> None:
+        """Tells these accounts from now on, of before messages that were read ahead; None: those of now."""
+        self._shown = accounts
 
     def offset_ns(self, pair: str) -> int | None:
         """Median of camera stamp minus LiDAR stamp, ns."""
@@ -118,6 +127,12 @@ class Intake:
                     continue
             pairs += [_frame_pair(lane.pair, paired) for paired in found]
         return pairs
+
+    def _account(self, lane: _Lane) -> tuple[int, Counter[str]]:
+        dropped = Counter(lane.dropped)
+        for (_, reason), number in lane.pairer.dropped.items():
+            dropped[reason] += number
+        return lane.received, +dropped
 
     def _lane(self, pair: str) -> _Lane:
         return next(lane for lane in self._lanes if lane.pair.name == pair)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from monitor.baseline_file import with_baselines
 from monitor.bus_replay import OverBus
+from monitor.candidate_file import SUFFIX
 from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
 from monitor.model_file import model_bytes
@@ -19,8 +20,11 @@ from pipeline.parameters import Parameters
 from pipeline.records import Floats
 from pipeline.segmentation import Segmenter
 
-OUTPUTS = ("status_log", "summary", "recording", "report")
+OUTPUTS = ("status_log", "summary", "recording", "report", "candidate")
 """What a replay writes (DESIGN 7)."""
+
+_AHEAD = 5
+"""Pairs read before the first of them is judged: a judgement takes as long as four others are looked at."""
 
 FILE_NAMES = (FILE_NAME, "status.jsonl", "report.html", "recording.rrd")
 """Under which names."""
@@ -63,7 +67,7 @@ def replay(
         under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
         source = open_source(location)
         with OverBus(source, "replay") if over_zenoh else source as messages:
-            state = watch(under_watch, messages, messages.losses, stop, progress)
+            state = watch(under_watch, messages, messages.losses, stop, progress, _AHEAD)
     finally:
         outputs.close()
     if outputs.losses:
@@ -77,6 +81,8 @@ def _opened(out: Path, vehicle: str, images_hz: float) -> Outputs:
         out.mkdir(parents=True, exist_ok=True)
         for name in FILE_NAMES:
             (out / name).unlink(missing_ok=True)
+        for earlier in out.glob(f"*{SUFFIX}"):
+            earlier.unlink()
         return open_outputs(OUTPUTS, Surroundings(vehicle, folder=out, images_hz=images_hz))
     except OSError as error:
         raise InputError(

@@ -1,0 +1,178 @@
+"""Pairs looked at ahead of their turn: everything that is told is what one pair after the other gives."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+
+from monitor.daemon import watch, watching
+from monitor.events import EndEvent, FrameEvent, StatusEvent
+from monitor.intake import Intake
+from monitor.lookahead import arrivals
+from monitor.messages import Message
+from monitor.outputs import Outputs
+from monitor.preparation import prepare
+from monitor.rig import parse_inject
+from monitor.sources import Losses, Tick
+from pipeline.errors import InputError
+from pipeline.frame_evidence import Scout
+from pipeline.parameters import Parameters
+from tests import drives
+from tests.drives import CLOUD_TOPIC
+
+SECOND = 1_000_000_000
+
+
+class Counting:
+    """A clock that counts its questions; two threads ask it."""
+
+    now_ns = 0
+
+    def monotonic_ns(self):
+        self.now_ns += 1
+        return self.now_ns
+
+    def wall_ns(self):
+        raise AssertionError("stamps of the data decide")
+
+
+class Told:
+    """An output that remembers, and may press a button."""
+
+    lost = None
+
+    def __init__(self, stop=None, at=None):
+        self.events = []
+        self._stop, self._at = stop, at
+
+    def handle(self, event):
+        self.events.append(event)
+        if len(self.events) == self._at:
+            self._stop.set()
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def rig(cut):
+    return prepare(str(cut(5)), None, parse_inject("yaw=1")).rig
+
+
+def items(recorded):
+    return [Message(m.topic, m.type, "cdr", m.data, m.log_ns) for m in recorded]
+
+
+def later(recorded, seconds):
+    """The same frames, measured and sent later."""
+    moved = [dataclasses.replace(m, log_ns=m.log_ns + seconds * SECOND) for m in recorded]
+    return [drives.stamped(m, drives.stamp_of(m) + seconds * SECOND) for m in moved]
+
+
+def told_of(rig, stream, ahead, told=None, stop=None):
+    """What is told of a stream: plain values, but for what stages cost."""
+    told = told or Told()
+    under = watching(rig, None, Parameters(), Outputs([("told", told)]), Counting())
+    watch(under, stream, Losses(), stop or threading.Event(), ahead=ahead)
+    return [plain(event) for event in told.events]
+
+
+def plain(event):
+    if isinstance(event, StatusEvent):
+        return event.status.model_dump(exclude={"timing_ms"})
+    if isinstance(event, FrameEvent):
+        estimated = None if event.T_estimated is None else event.T_estimated.tolist()
+        return event.stamp_ns, event.points.tobytes(), event.edge_points.tobytes(), estimated
+    assert isinstance(event, EndEvent)
+    return event
+
+
+def stories(messages):
+    """Streams with everything that makes a watch forget."""
+    first = drives.first_frames(messages, 9)
+    end_ns = max(message.log_ns for message in first)
+    ticks = [Tick(end_ns + step * SECOND // 2) for step in range(1, 8)]
+    rest = [m for m in drives.first_frames(messages, 16) if m.sequence >= 9]
+    broken = [dataclasses.replace(m, data=m.data[:9]) if m.topic == CLOUD_TOPIC else m for m in rest[:6]]
+    return {
+        "in order": items(first),
+        "a silence": [*items(first), *ticks, *items(later(rest, 60))],
+        "a gap": [*items(first), *items(later(rest, 60))],
+        "a clock that runs back": [*items(later(first, 60)), *items(rest)],
+        "undecodable": [*items(first), *items(broken), *items(rest)],
+    }
+
+
+@pytest.mark.parametrize("story", ["in order", "a silence", "a gap", "a clock that runs back", "undecodable"])
+def test_all_that_is_told_is_the_same(rig, messages, story):
+    stream = stories(messages)[story]
+    plainly = told_of(rig, stream, 0)
+    assert sum(isinstance(event, tuple) for event in plainly) >= 8
+    assert told_of(rig, stream, 5) == plainly
+
+
+def test_what_is_found_ahead_is_used(rig, messages, monkeypatch):
+    threads = []
+    look = Scout.look
+
+    def noted(self, *arguments):
+        threads.append(threading.current_thread().name)
+        return look(self, *arguments)
+
+    monkeypatch.setattr(Scout, "look", noted)
+    told_of(rig, stories(messages)["in order"], 5)
+    # The last pair is decided when the recording ends, which no thread can know.
+    assert sum(name.startswith("lookahead") for name in threads) == len(threads) - 1
+
+
+def test_a_run_that_is_stopped_tells_what_was_judged(rig, messages):
+    stream = items(drives.first_frames(messages, 12))
+    stops = [threading.Event(), threading.Event()]
+    plainly, ahead = (
+        told_of(rig, stream, most, Told(stop, 6), stop) for most, stop in zip((0, 5), stops, strict=True)
+    )
+    assert ahead == plainly
+    assert not ahead[-1].complete
+
+
+class Failing:
+    """A source that fails after some messages."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def __iter__(self):
+        yield from self._stream
+        raise InputError("the rest is not there")
+
+
+def test_a_source_that_fails_does_so_after_what_came_before(rig, messages):
+    stream = items(drives.first_frames(messages, 9))
+    found = []
+    for ahead in (0, 5):
+        told = Told()
+        with pytest.raises(InputError, match="not there"):
+            told_of(rig, Failing(stream), ahead, told)
+        found.append([plain(event) for event in told.events])
+    assert found[0] == found[1]
+    assert len(found[0]) >= 8
+
+
+def test_arrivals_keep_their_order_and_their_accounts(rig, messages):
+    stream = [*items(drives.first_frames(messages, 9)), Tick(5)]
+    live, shown = Intake(rig), []
+    plainly = [
+        (item.item, item.pairs, item.accounts, item.notes) for item in arrivals(stream, live, 0, shown.append)
+    ]
+    assert [item for item, *_ in plainly] == stream
+    seen, ahead, most = [], [], 0
+    for arrival in arrivals(stream, Intake(rig), 4, seen.append):
+        ahead.append(arrival)
+        most = max(most, len(seen) - sum(len(one.pairs) for one in ahead[:-1]))
+    assert [one.item for one in ahead] == stream
+    assert [one.accounts for one in ahead] == [accounts for _, _, accounts, _ in plainly]
+    assert most == 4
+    for one, (_, pairs, _, _) in zip(ahead, plainly, strict=True):
+        assert [pair.image_stamp_ns for pair in one.pairs] == [pair.image_stamp_ns for pair in pairs]
+    assert np.array_equal(seen[0].cloud.xyz, shown[0].cloud.xyz)

@@ -16,12 +16,13 @@ from monitor.statements import TO_PEOPLE
 from monitor.status import AXIS_NAMES
 from monitor.wording import size_text
 from pipeline.baseline import Baseline, LeftOut, learn, left_out
+from pipeline.drift_test import DriftTestParameters
 from pipeline.drive_estimates import Drive, Driven
 from pipeline.errors import InputError, RigError
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats
-from pipeline.road_samples import Scatter, sample_of
+from pipeline.road_samples import Scatter, largest_change, sample_of
 from pipeline.segmentation import Segmenter
 
 WANTED_S = 365 * 8 * 3600.0
@@ -161,9 +162,9 @@ def learned_from(mount: Mount, drives: Sequence[Drive], pair: str) -> Learned:
             f"pair {pair}: nothing to learn from: {listed}",
             hint="longer recordings in good light, with poles, kerbs and lane markings",
         )
-    _refuse_unhealthy(mount, usable, pair)
-    _refuse_twins(usable, pair)
     parameters = Parameters()
+    _refuse_unhealthy(mount, usable, pair, parameters.test)
+    _refuse_twins(usable, pair)
     rng = np.random.default_rng(parameters.seed)
     baseline = learn([drive.estimates for drive in usable], parameters.test, WANTED_S, rng)
     others = left_out(baseline.stretches, parameters.test)
@@ -171,18 +172,25 @@ def learned_from(mount: Mount, drives: Sequence[Drive], pair: str) -> Learned:
     return Learned(mount, baseline, others, unused)
 
 
-def _refuse_unhealthy(mount: Mount, drives: Sequence[Drive], pair: str) -> None:
-    """InputError names every drive that is surely beyond an alert limit, or in which the mount moved."""
+def _refuse_unhealthy(mount: Mount, drives: Sequence[Drive], pair: str, test: DriftTestParameters) -> None:
+    """InputError names every drive that is surely beyond an alert limit, or on which the mount moved.
+
+    One that is told drifted, but by less and from its first window on, shows how far the stored extrinsic is
+    off: that is the bias.
+    """
     troubles = []
     for drive in drives:
-        name, onset = drive.estimates.recording, drive.memory.onset
+        name = drive.estimates.recording
         sample = sample_of(drive.estimates, Scatter(noise=1.0, correlation_m=np.inf))
         sigma = np.sqrt(np.diag(sample.covariance))
         beyond = np.abs(sample.mean) - _SURE_SIGMAS * sigma > mount.limits
         if beyond.any():
             troubles.append(f"{name} is off by {_sizes(sample.mean, np.flatnonzero(beyond))}")
-        elif drive.memory.state == "drifted" and (onset is None or onset.stamp_ns > onset.from_ns):
-            troubles.append(f"{name} drifted on the way ({drive.memory.reason.rstrip('.')})")
+            continue
+        change = largest_change(drive.estimates, test.floor())
+        if change.statistic > test.alarm:
+            axis = int(np.argmax(np.abs(change.difference) / mount.limits))
+            troubles.append(f"{name} moved on the way by {_sizes(change.difference, [axis])}")
     if troubles:
         raise InputError(
             f"pair {pair}: not healthy: {'; '.join(troubles)}",

@@ -28,6 +28,9 @@ _SHORTEST_CORRELATION_M = 20.0
 _CORRELATIONS = 16
 """Correlation lengths that are tried, from the shortest to ``STRETCH_M``, each 1.17 times the one before."""
 
+_LEAST_WINDOWS = 3
+"""Windows on each side of a change: one alone may lie in a false mode."""
+
 _PRIOR_DRIVES = 4.0
 """Drives on which the stated sigma was measured (PROBE 4): as many samples as stand behind a noise of 1."""
 
@@ -218,3 +221,43 @@ def sample_of(part: WindowEstimates, scatter: Scatter) -> RoadSample:
         way_m=float(part.way_m[:, 1].max() - part.way_m[:, 0].min()),
         seconds=float(part.stamp_ns[-1] - part.stamp_ns[0]) / 1e9,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """The largest difference between what a drive shows before and after one of its windows.
+
+    Attributes:
+        difference: float64 (6,), mean after it minus mean before it, rad and m.
+        statistic: Joint statistic, chi-square of six degrees of freedom where nothing moved.
+    """
+
+    difference: Floats
+    statistic: float
+
+
+def largest_change(drive: WindowEstimates, floor: Floats) -> Change:
+    """Whether something moved on the way: all windows up to one against all after it, three at least each.
+
+    Neither side is taken to know more than one window and one scene do, however long it is: it errs towards
+    no change.
+
+    Args:
+        drive: Its windows.
+        floor: float64 (6,6), covariance of what a scene adds.
+    """
+    information = np.linalg.inv(drive.covariance)
+    pulls = [np.einsum("nij,nj->ni", information, values) for values in (drive.drift, drive.feigned)]
+    total, (drift, feigned) = information.cumsum(axis=0), (pull.cumsum(axis=0) for pull in pulls)
+    largest = Change(np.zeros(6), 0.0)
+    count = len(drive)
+    for split in range(_LEAST_WINDOWS, count - _LEAST_WINDOWS + 1):
+        before = np.linalg.inv(total[split - 1])
+        after = np.linalg.inv(total[-1] - total[split - 1])
+        difference = after @ (drift[-1] - drift[split - 1]) - before @ drift[split - 1]
+        clock = after @ (feigned[-1] - feigned[split - 1]) - before @ feigned[split - 1]
+        P = split * before + (count - split) * after + 2.0 * floor + np.outer(clock, clock)
+        statistic = float(difference @ np.linalg.solve(P, difference))
+        if statistic > largest.statistic:
+            largest = Change(difference, statistic)
+    return largest

@@ -233,15 +233,16 @@ def test_a_drive_that_is_off_by_more_than_a_limit_is_refused_by_name():
 
 
 def test_a_drive_on_which_the_mount_moved_is_refused_by_name():
-    from pipeline.onset import Onset  # noqa: PLC0415 - only here
-
     one, other = drives(2)
-    moved = watched(one, state="drifted", severity="minor", onset=Onset(5, 4, 6), reason="It moved.")
-    with pytest.raises(InputError, match=r"drive 0 drifted on the way \(It moved\)"):
-        learned_from(MOUNT, [moved, watched(other)], "front")
-    # Off by a little from its first frame on, it shows the stored extrinsic's own error: that is the bias.
-    before = watched(one, state="drifted", severity="minor", onset=Onset(4, 4, 6), reason="It moved.")
-    assert len(learned_from(MOUNT, [before, watched(other)], "front").baseline.stretches) == 2
+    slip = np.zeros_like(one.drift)
+    slip[len(one) // 2 :, 2] = -math.radians(0.6)
+    moved = dataclasses.replace(one, drift=one.drift + slip)
+    with pytest.raises(InputError, match=r"not healthy: drive 0 moved on the way by yaw -0\.[56]"):
+        learned_from(MOUNT, [watched(moved), watched(other)], "front")
+    # Off by a little from its first window on, it shows the stored extrinsic's own error: that is the bias.
+    off = [dataclasses.replace(drive, drift=drive.drift + 3e-3) for drive in (one, other)]
+    found = learned_from(MOUNT, [watched(drive, state="drifted") for drive in off], "front").baseline
+    assert found.bias == pytest.approx(learned(2).bias + 3e-3)
 
 
 def test_a_drive_that_differs_from_the_others_is_refused_by_name():

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 
 import numpy as np
@@ -10,11 +11,12 @@ from pipeline.road_samples import (
     Scatter,
     WindowEstimates,
     effective_samples,
+    largest_change,
     sample_of,
     scatter_of,
     stretches_of,
 )
-from tests.pipeline.simulated_windows import RANDOM, simulated_drive
+from tests.pipeline.simulated_windows import FLOOR, RANDOM, simulated_drive
 
 
 def windows(way_m, span_m=30.0, drift=None, covariance=RANDOM):
@@ -122,6 +124,38 @@ def test_stretches_share_no_frame_and_are_long_enough(steps, span):
 def test_a_vehicle_that_stands_gives_one_window():
     (part,) = stretches_of(windows(np.full(50, 30.0)))
     assert len(part) == 1
+
+
+def test_a_change_on_the_way_is_found_with_its_size():
+    rng = np.random.default_rng(4)
+    slip = np.array([0.0, 12e-3, 0.0, 0.0, 0.0, 0.0])
+    for at in (4, 12, 18):
+        drive = simulated_drive(rng, "slips", spread=FLOOR)
+        after = np.arange(len(drive))[:, None] >= at
+        found = largest_change(dataclasses.replace(drive, drift=drive.drift + after * slip), FLOOR)
+        assert found.statistic > 27.86
+        assert found.difference[1] == pytest.approx(12e-3, abs=1e-3)
+
+
+def test_healthy_drives_show_no_change_though_scenes_change():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        halves = [simulated_drive(rng, "healthy", spread=FLOOR) for _ in range(2)]
+        drift = np.concatenate([half.drift for half in halves])
+        way = np.arange(len(drift)) * 10.0 + 40.0
+        assert largest_change(windows(way, drift=drift), FLOOR).statistic < 27.86
+
+
+def test_too_few_windows_and_the_speed_of_a_fooled_clock_show_no_change():
+    drift = np.zeros((4, 6))
+    drift[2:, 2] = 1.0
+    assert largest_change(windows(np.arange(4) * 9.0, drift=drift), FLOOR).statistic == 0.0
+    drift = np.zeros((20, 6))
+    drift[10:, 3] = 0.5  # twice as fast, and the stamps off by one sigma
+    fooled = windows(np.arange(20) * 9.0, drift=drift)
+    assert largest_change(fooled, FLOOR).statistic > 27.86
+    told = dataclasses.replace(fooled, feigned=drift)
+    assert largest_change(told, FLOOR).statistic < 2.0
 
 
 def test_a_drive_without_windows_gives_no_stretch():

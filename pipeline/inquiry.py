@@ -134,16 +134,16 @@ class Inquiry:
         cause = found.cause(settings)
         if cause == "mount" or (cause == "cause_open" and not claimed):
             return None
-        return Doubt(cause, _REASONS[cause].format(**_sizes(found)))
+        return Doubt(cause, REASONS[cause].format(**_sizes(found)))
 
     def _unnoticed(self, found: Explanation, settings: CauseParameters) -> Doubt | None:
         """What surely changed and matters, though no window alone shows it."""
         limits = self._mount.limits
         late = abs(found.time_offset_s) * found.motion
         if found.changed("clock", settings) and found.separable and bool(np.any(late > limits)):
-            return Doubt("time_offset", _REASONS["time_offset"].format(**_sizes(found)))
+            return Doubt("time_offset", REASONS["time_offset"].format(**_sizes(found)))
         if found.changed("lens", settings) and abs(found.zoom) * self._border() > float(limits[1:3].min()):
-            return Doubt("intrinsics_changed", _REASONS["intrinsics_changed"].format(**_sizes(found)))
+            return Doubt("intrinsics_changed", REASONS["intrinsics_changed"].format(**_sizes(found)))
         return None
 
     def _border(self) -> float:
@@ -154,7 +154,7 @@ class Inquiry:
         return slope / (1.0 + slope**2)
 
 
-_REASONS = {
+REASONS = {
     "time_offset": "Sweeps and images are {delay:+.0f} ms apart (sigma {delay_sigma:.0f}) beyond "
     "their stamps: the mount need not have moved.",
     "intrinsics_changed": "The focal length is {zoom:+.1f} % off the stored one (sigma {zoom_sigma:.1f}): "
@@ -163,6 +163,7 @@ _REASONS = {
     "the speeds driven so far do not tell which.",
     "cause_open": "Mount, clock or lens has changed: the drive so far does not tell which.",
 }
+"""What is said of each cause but the mount."""
 
 
 def _sizes(found: Explanation) -> dict[str, float]:

@@ -195,6 +195,7 @@ class Engine:
                 rates=self._rates(),
                 timing={name: _quantiles(values) for name, values in self._timing.items()},
                 outputs_lost=self._outputs_lost(),
+                explanation=self.watch.inquiry.explanation,
             ),
             self._seq,
             self._now_ns,

@@ -6,6 +6,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor.candidate_file import CandidateDocument
+from monitor.parts import Parts
 from monitor.status import Status
 from pipeline.records import (
     CameraImage,
@@ -69,6 +71,21 @@ class FrameEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class ProposalEvent:
+    """What is proposed for a pair has changed.
+
+    Attributes:
+        pair: Name of the pair.
+        document: The extrinsic that is proposed, or None: nothing is.
+        reason: Why nothing is proposed, one sentence; empty with a document.
+    """
+
+    pair: str
+    document: CandidateDocument | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class EndEvent:
     """Nothing more comes.
 
@@ -76,14 +93,16 @@ class EndEvent:
         complete: Whether the input was read to its end; False: interrupted or failed.
         note: One sentence for people, or empty.
         warnings: What else people should know of this run (what the source lost), one sentence each.
+        parts: Which part of the rig has moved, for each LiDAR that several pairs share.
     """
 
     complete: bool
     note: str = ""
     warnings: tuple[str, ...] = ()
+    parts: tuple[Parts, ...] = ()
 
 
-Event: TypeAlias = StatusEvent | FrameEvent | EndEvent
+Event: TypeAlias = StatusEvent | FrameEvent | ProposalEvent | EndEvent
 
 
 class Output(Protocol):

@@ -27,7 +27,7 @@ from pipeline.segmentation import Segmenter
 
 _log = logging.getLogger(__name__)
 
-FILES = ("status_log", "summary", "recording", "report")
+FILES = ("status_log", "summary", "recording", "report", "candidate")
 """What goes into ``--out``."""
 
 SURVEY_NS = 10_000_000_000
@@ -87,7 +87,8 @@ def run(
         if out is not None:
             _make(out)
         surroundings = Surroundings(rig.vehicle, folder=out, session=session, images_hz=images_hz)
-        outputs = open_outputs(("status_bus", *(FILES if out is not None else ())), surroundings)
+        names = ("status_bus", "candidate_bus", *(FILES if out is not None else ()))
+        outputs = open_outputs(names, surroundings)
         try:
             under_watch = watching(rig, segmenter, Parameters(), outputs, clock, _log.warning)
             pairs = tuple(under_watch.engines)

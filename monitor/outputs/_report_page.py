@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
-from monitor.events import EndEvent
+from monitor.events import EndEvent, ProposalEvent
 from monitor.outputs._history import Change
 from monitor.outputs._overlays import Crop, Overlay
+from monitor.outputs._proposal import proposal_section
 from monitor.outputs._series import Sample
 from monitor.status import (
     AXIS_NAMES,
@@ -46,6 +47,7 @@ class PairMaterial:
         samples: Drift over time.
         overlays: (title, overlay), the most telling first.
         overlays_left_out: Number of pictures that the size of the page did not allow.
+        proposal: What is proposed for a mount that has moved, or why nothing is; None while it has not.
     """
 
     last: Status
@@ -54,6 +56,7 @@ class PairMaterial:
     samples: tuple[Sample, ...]
     overlays: tuple[tuple[str, Overlay], ...]
     overlays_left_out: int
+    proposal: ProposalEvent | None = None
 
 
 def page(vehicle: str, pairs: tuple[PairMaterial, ...], end: EndEvent) -> str:
@@ -92,6 +95,7 @@ def _page(vehicle: str, pairs: tuple[PairMaterial, ...], end: EndEvent) -> dict[
         "complete": end.complete,
         "note": end.note,
         "warnings": end.warnings,
+        "parts": [part.sentence for part in end.parts],
         "pairs": [_pair(index, pair) for index, pair in enumerate(ordered)],
         "series": [_plotted(index, pair) for index, pair in enumerate(ordered)],
     }
@@ -129,6 +133,7 @@ def _pair(index: int, pair: PairMaterial) -> dict[str, Any]:
         ],
         "overlays": [_overlay(title, overlay) for title, overlay in pair.overlays],
         "no_overlay": _no_overlay(pair),
+        "proposal": None if pair.proposal is None else proposal_section(pair.proposal),
         "tables": _tables(status),
     }
 

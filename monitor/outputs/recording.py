@@ -12,7 +12,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from monitor.events import EndEvent, Event, FrameEvent
+from monitor.events import EndEvent, Event, FrameEvent, ProposalEvent
 from monitor.outputs import OutputKind, folder_of, rename_whole
 
 if TYPE_CHECKING:  # half a second and 500 MB of library that commands without a recording do without
@@ -80,6 +80,8 @@ class Recording:
         """Queues the event; the end waits until all is written and gives the file its name."""
         if isinstance(event, EndEvent):
             self._end(event)
+        elif isinstance(event, ProposalEvent):
+            return
         elif self._lost is None and not (isinstance(event, FrameEvent) and self._too_soon(event)):
             with self._changed:
                 self._make_room(

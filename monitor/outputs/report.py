@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from monitor.events import EndEvent, Event, FrameEvent, StatusEvent
+from monitor.events import EndEvent, Event, FrameEvent, ProposalEvent, StatusEvent
 from monitor.outputs import OutputKind, folder_of, write_whole
 from monitor.outputs._history import History
 from monitor.outputs._overlays import KeptFrame, Overlay, keep, overlay
@@ -33,6 +33,7 @@ class _PairRecord:
         self.history = History(first)
         self.first_ns = first.stamp_ns
         self.series = Series(_MOST_SAMPLES)
+        self.proposal: ProposalEvent | None = None
         self._newest: FrameEvent | None = None
         self._kept: dict[State, KeptFrame] = {}
         self._before: KeptFrame | None = None
@@ -96,6 +97,9 @@ class Report:
         elif isinstance(event, FrameEvent):
             if event.pair in self._pairs:
                 self._pairs[event.pair].show(event)
+        elif isinstance(event, ProposalEvent):
+            if event.pair in self._pairs:
+                self._pairs[event.pair].proposal = event
         else:
             self._write(event)
 
@@ -115,6 +119,7 @@ class Report:
                 samples=record.series.thinned(most),
                 overlays=tuple(pictures[place]),
                 overlays_left_out=left_out[place],
+                proposal=record.proposal if record.history.last.severity is not None else None,
             )
             for place, record in enumerate(records)
         )

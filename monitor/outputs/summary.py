@@ -5,9 +5,11 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitor.events import EndEvent, Event, StatusEvent
+from monitor.candidate_file import SUFFIX
+from monitor.events import EndEvent, Event, ProposalEvent, StatusEvent
 from monitor.outputs import OutputKind, folder_of, write_whole
 from monitor.outputs._history import Change, History
+from monitor.parts import Parts
 from monitor.status import Frames, Name, State, Status, first_in_precedence
 
 FILE_NAME = "summary.json"
@@ -19,6 +21,14 @@ class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True, serialize_by_alias=True)
 
 
+class Proposed(_Part):
+    """What was proposed for a pair whose mount has moved."""
+
+    file: str | None = Field(description="the candidate beside this file; null: nothing is proposed")
+    hash: str | None = Field(description="of the candidate, as in its file")
+    reason: str = Field(description="why nothing is proposed; empty where something is")
+
+
 class PairSummary(_Part):
     """What was said of one pair."""
 
@@ -27,6 +37,7 @@ class PairSummary(_Part):
         description="every change of state or code, the first state included"
     )
     frames: Frames
+    candidate: Proposed | None = Field(default=None, description="null: no drift stands")
     last: Status = Field(description="the last status")
 
 
@@ -39,6 +50,9 @@ class Summary(_Part):
     note: str
     vehicle: Name
     pairs: dict[Name, PairSummary]
+    parts: tuple[Parts, ...] = Field(
+        default=(), description="which part has moved, for each LiDAR that several pairs share"
+    )
     warnings: tuple[str, ...]
 
 
@@ -49,6 +63,7 @@ class SummaryFile:
         self._path = folder / FILE_NAME
         self._vehicle = vehicle
         self._histories: dict[str, History] = {}
+        self._proposed: dict[str, Proposed] = {}
 
     @property
     def lost(self) -> str | None:
@@ -60,6 +75,13 @@ class SummaryFile:
         if isinstance(event, StatusEvent):
             status = event.status
             self._histories.setdefault(status.pair, History(status)).note(status)
+        elif isinstance(event, ProposalEvent):
+            document = event.document
+            self._proposed[event.pair] = Proposed(
+                file=None if document is None else f"{event.pair}{SUFFIX}",
+                hash=None if document is None else document.hash,
+                reason=event.reason,
+            )
         elif isinstance(event, EndEvent):
             write_whole(self._path, self.summary(event).model_dump_json(indent=2).encode() + b"\n")
 
@@ -73,6 +95,7 @@ class SummaryFile:
                 state=history.last.state,
                 timeline=history.timeline,
                 frames=history.last.frames,
+                candidate=self._proposed.get(pair) if history.last.severity is not None else None,
                 last=history.last,
             )
             for pair, history in sorted(self._histories.items())
@@ -83,6 +106,7 @@ class SummaryFile:
             note=end.note,
             vehicle=self._vehicle,
             pairs=pairs,
+            parts=end.parts,
             warnings=end.warnings,
         )
 

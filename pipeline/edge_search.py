@@ -12,7 +12,15 @@ from typing import TypeAlias
 import numpy as np
 
 from pipeline import se3, trust_region
-from pipeline.edge_score import UNITS, EdgeBatch, score, score_and_gradient
+from pipeline.edge_score import (
+    UNITS,
+    EdgeBatch,
+    preference,
+    score,
+    score_and_gradient,
+    score_only,
+    seen_from,
+)
 from pipeline.records import Floats
 from pipeline.trust_region import SearchParameters
 
@@ -31,10 +39,15 @@ class EdgeWitnessParameters:
             coarse levels lead into false modes, which score up to 3 % more; real drifts gain over 12 %.
         stirring_gain: Where the best maximum scores so much more than the stored extrinsic, share, others are
             sought from further away: what looks like one small drift may be another, larger one.
+        lost_gain: Where the nearest maximum scores so much more than the stored extrinsic, share, nothing
+            speaks for the nearest any more: the highest of all is believed. Healthy windows gained less, on
+            four drives (PROBE 5).
         wide_gain: A maximum found from further away must score so much more than the best near one: false
             modes score up to 3 % more than the truth (PROBE 6).
-        wide_rad: Turn about each axis from which it is sought.
-        wide_m: Shift along each axis from which it is sought.
+        least_preference: Standard errors by which the cells of the image, one by one, must prefer it too:
+            chance gives so many in one case of twenty.
+        wide_rad: Step of the turns from which it is sought: the coarsest level's blur reaches half of it.
+        wide_m: Shift ahead and back from which it is sought.
         farthest_rad: A maximum further from the stored extrinsic is not believed.
         farthest_m: Likewise.
         contrast_starts: Random extrinsics that tell the score of chance.
@@ -50,8 +63,10 @@ class EdgeWitnessParameters:
     sigma_factor: float = 2.0
     least_gain: float = 0.02
     stirring_gain: float = 0.03
+    lost_gain: float = 0.10
     wide_gain: float = 0.05
-    wide_rad: float = math.radians(1.0)
+    least_preference: float = 1.64
+    wide_rad: float = math.radians(0.75)
     wide_m: float = 0.3
     farthest_rad: float = math.radians(5.0)
     farthest_m: float = 1.0
@@ -132,10 +147,13 @@ def find_maxima(
         rivals = _followed(batch, T_stored, known, parameters, curvature)
         searched, widely = known.searched_ns, known.widely
     base = nearest if _near(nearest[0], parameters) and nearest[1] > stored[0] else (np.zeros(6), stored[0])
-    best, kept = _preferred(base, rivals, parameters)
+    lost = base[1] > stored[0] * (1.0 + parameters.lost_gain)
+    best, kept = _preferred(batch, T_stored, base, rivals, parameters, lost=lost)
     if not widely and best[1] > stored[0] * (1.0 + parameters.stirring_gain):
-        further = (_from_further_away(batch, T_stored, best[0], parameters), parameters.wide_gain)
-        best, kept = _preferred(base, [*rivals, further], parameters)
+        further = _from_further_away(batch, T_stored, best[0], parameters, lost=lost)
+        best, kept = _preferred(
+            batch, T_stored, base, [*rivals, (further, parameters.wide_gain)], parameters, lost=lost
+        )
         widely = True
     return Maxima(nearest[0], kept, searched, widely), best
 
@@ -146,15 +164,29 @@ def _renewed(stamps_ns: Sequence[int], searched_ns: Sequence[int]) -> bool:
 
 
 def _preferred(
-    base: Top, rivals: Sequence[tuple[Top, float]], parameters: EdgeWitnessParameters
+    batch: EdgeBatch,
+    T_stored: Floats,
+    base: Top,
+    rivals: Sequence[tuple[Top, float]],
+    parameters: EdgeWitnessParameters,
+    *,
+    lost: bool,
 ) -> tuple[Top, tuple[Rival, ...]]:
-    """The maximum to believe, and the rivals that were better than all before them."""
-    best, kept = base, []
+    """The maximum to believe, and the rival that it is, if any; ``lost``: by its height alone."""
+    best, kept = base, None
     for top, gain in rivals:
-        if top[1] > best[1] * (1.0 + gain) and _near(top[0], parameters):
-            best = top
-            kept.append(Rival(top[0], gain))
-    return best, tuple(kept[-1:])
+        if not _near(top[0], parameters) or top[1] <= best[1]:
+            continue
+        clearly = top[1] > best[1] * (1.0 + gain)
+        if lost or (clearly and _prefer(batch, T_stored, (top[0], best[0])) > parameters.least_preference):
+            best, kept = top, Rival(top[0], gain)
+    return best, () if kept is None else (kept,)
+
+
+def _prefer(batch: EdgeBatch, T_stored: Floats, places: tuple[Floats, Floats]) -> float:
+    """How clearly the cells of the image prefer the first of two xi, standard errors."""
+    better, worse = (score_only(batch, se3.retract(T_stored, xi), 0) for xi in places)
+    return preference(batch, better, worse)
 
 
 def _followed(
@@ -180,7 +212,7 @@ def _by_coarser(
         xi = np.zeros(6)
         for level in schedule:
             xi, _ = ascend(thin, T_stored, xi, level, parameters)
-        if np.linalg.norm((xi - nearest[0]) / UNITS) >= _SAME_MODE:
+        if _apart(xi, nearest[0]) >= _SAME_MODE:
             tops.append(ascend(batch, T_stored, xi, 0, parameters))
     return tops
 
@@ -192,18 +224,79 @@ def _near(xi: Floats, parameters: EdgeWitnessParameters) -> bool:
 
 
 def _from_further_away(
-    batch: EdgeBatch, T_stored: Floats, xi: Floats, parameters: EdgeWitnessParameters
+    batch: EdgeBatch, T_stored: Floats, xi: Floats, parameters: EdgeWitnessParameters, *, lost: bool
 ) -> Top:
-    """The highest maximum reached from turns and shifts of each axis, both ways, or from ``xi``."""
-    thin = batch.thinned(_COARSE_STRIDE)
-    steps = np.diag([parameters.wide_rad] * 3 + [parameters.wide_m] * 3)
-    top, height = xi, score(thin, se3.retract(T_stored, xi), 0)[0]
-    for start in np.concatenate([steps, -steps]):
-        reached, _ = ascend(thin, T_stored, start, 1, parameters)
-        reached, value = ascend(thin, T_stored, reached, 0, parameters)
-        if value > height and _near(reached, parameters):
-            top, height = reached, value
-    return ascend(batch, T_stored, top, 0, parameters)
+    """The highest maximum reached from turns about all axes and from shifts ahead, or from ``xi``.
+
+    Where the stored extrinsic is ``lost``, that maximum is climbed about once more, axis by axis.
+    """
+    thin = batch.thinned(max(1, len(batch) // _SEARCHED))
+    top = (xi, score(thin, se3.retract(T_stored, xi), 0)[0])
+    known = [xi]
+    for begin in _promising(thin, T_stored, parameters):
+        top = _climbed(thin, T_stored, begin, known, top, parameters)
+    if lost:
+        for step in np.concatenate([np.diag(UNITS), -np.diag(UNITS)]) * _HOP:
+            top = _climbed(thin, T_stored, top[0] + step, known, top, parameters)
+    return ascend(batch, T_stored, top[0], 0, parameters)
+
+
+def _climbed(
+    thin: EdgeBatch,
+    T_stored: Floats,
+    begin: Floats,
+    known: list[Floats],
+    top: Top,
+    parameters: EdgeWitnessParameters,
+) -> Top:
+    """The maximum reached from ``begin`` where it is higher than ``top`` and none of the ``known`` ones."""
+    reached, _ = ascend(thin, T_stored, begin, 1, parameters)
+    if min(_apart(reached, other) for other in known) < _SAME_MODE:
+        return top
+    known.append(reached)
+    reached, value = ascend(thin, T_stored, reached, 0, parameters)
+    return (reached, value) if value > top[1] and _near(reached, parameters) else top
+
+
+_HOP = 3.0
+"""Alert units: beyond what the blur of level 1 bridges (0.75 deg, 15 cm)."""
+
+
+def _promising(thin: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParameters) -> list[Floats]:
+    """Where climbs from further away begin: the best of a grid of turns, and shifts ahead and back.
+
+    A shift aside looks like a turn at any one range, so turns lead to both (PROBE 3); only a shift along the
+    optical axis looks like none.
+    """
+    ticks = np.arange(-_TICKS, _TICKS + 1) * parameters.wide_rad
+    turns = np.stack(np.meshgrid(ticks, ticks, ticks[_TICKS % 2 :: 2], indexing="ij"), axis=-1).reshape(-1, 3)
+    places = np.hstack([turns, np.zeros_like(turns)])
+    level = len(thin.images) - 1
+    seen = seen_from(thin.thinned(_COARSE_STRIDE), [se3.retract(T_stored, place) for place in places])
+    heights = np.bincount(seen.cell, score_only(seen, np.eye(4), level))
+    starts: list[Floats] = []
+    for k in np.argsort(-heights, kind="stable"):
+        if len(starts) == _PROMISING:
+            break
+        if all(np.abs(places[k] - start).max() > parameters.wide_rad * 1.01 for start in starts):
+            starts.append(places[k])
+    ahead = np.array([0.0, 0.0, 0.0, 0.0, 0.0, parameters.wide_m])
+    return [*starts, ahead, -ahead]
+
+
+_SEARCHED = 1200
+"""Edges that a search from further away looks at; all of them decide."""
+
+_TICKS = 3
+"""Steps of the grid to each side; every other one of roll, which is seen less sharply."""
+
+_PROMISING = 5
+"""Best places of the grid that are climbed from."""
+
+
+def _apart(a: Floats, b: Floats) -> float:
+    """Distance of two xi, alert units."""
+    return float(np.linalg.norm((a - b) / UNITS))
 
 
 def ascend(

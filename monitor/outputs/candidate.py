@@ -11,6 +11,7 @@ class CandidateFiles:
     """Keeps for each pair the file of what is proposed; none where nothing is proposed any more."""
 
     def __init__(self, folder: Path) -> None:
+        folder.stat()  # a folder that is not there fails now, not when there is something to write
         self._folder = folder
 
     @property

@@ -1,4 +1,4 @@
-"""What one pair of sweep and image says by itself: its motion, edges, gradients and lines.
+"""What one pair of sweep and image says by itself: its motion, edges and lines.
 
 Nothing here knows of the window or the verdict: a frame can be looked at while those before it are judged.
 """
@@ -58,7 +58,7 @@ class FrameEvidence:
         cloud: The sweep as it was used.
         edge_points: float32 (M,3), points at jumps of range, LiDAR frame.
         straight: How the sweep was brought to the exposure; None where the pair was not looked at.
-        edge_frame: Its edges as a window keeps them, or None where they are too few.
+        edges: Its edges, or None where they are too few.
         masks: Its masks, or None where it got none.
         lines: Its lines, or None where it got none.
     """
@@ -67,9 +67,29 @@ class FrameEvidence:
     cloud: PointCloud
     edge_points: np.ndarray
     straight: Straightened | None = None
-    edge_frame: EdgeFrame | None = None
+    edges: Edges | None = None
     masks: Masks | None = None
     lines: LineFrame | None = None
+
+
+def edge_frame(
+    pair: FramePair, edges: Edges, straight: Straightened, mount: Mount, stage: Stage
+) -> EdgeFrame:
+    """Edges as a window keeps them, with the gradients of the image.
+
+    Args:
+        pair: Where they are from.
+        edges: Of its sweep.
+        straight: How the sweep was brought to the exposure.
+        mount: What is stored of the pair.
+        stage: Measures the stages.
+    """
+    with stage("gradients"):
+        gradients = gradient_pyramid(pair.image, mount.camera)
+    frame = EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m, mount.feigned(straight))
+    with stage("information"):
+        information = edge_witness.information_of(frame, mount.camera, mount.T_cam_lidar)
+    return dataclasses.replace(frame, information=information)
 
 
 class Scout:
@@ -130,25 +150,13 @@ class Scout:
         masks, lines = None, None
         if self._lines_due(pair.image_stamp_ns, straight):
             masks, lines = self._lines_of(pair, ground, rng, stage)
-        edge_frame = None
-        if edges is not None and len(edges) >= _LEAST_EDGES:
-            edge_frame = self._edge_frame(pair, edges, straight, stage)
+        enough = edges if edges is not None and len(edges) >= _LEAST_EDGES else None
         found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
         dropped: DropReason | None = None
-        if edge_frame is None and not found_lines:
+        if enough is None and not found_lines:
             dropped = "no_scan_pattern" if edges is None else "no_edges"
         points = nothing if edges is None else edges.position[edges.kind == RING_JUMP].astype(np.float32)
-        return FrameEvidence(dropped, pair.cloud, points, straight, edge_frame, masks, lines)
-
-    def _edge_frame(self, pair: FramePair, edges: Edges, straight: Straightened, stage: Stage) -> EdgeFrame:
-        """The edges as a window keeps them."""
-        mount = self._mount
-        with stage("gradients"):
-            gradients = gradient_pyramid(pair.image, mount.camera)
-        frame = EdgeFrame(pair.image_stamp_ns, edges, gradients, straight.distance_m, mount.feigned(straight))
-        with stage("information"):
-            information = edge_witness.information_of(frame, mount.camera, mount.T_cam_lidar)
-        return dataclasses.replace(frame, information=information)
+        return FrameEvidence(dropped, pair.cloud, points, straight, enough, masks, lines)
 
     def _lines_due(self, now_ns: int, straight: Straightened) -> bool:
         """Whether the frame gets masks and lines; it is then the last that got them."""

@@ -14,7 +14,7 @@ from pipeline.belief import Belief, believe
 from pipeline.candidate import Proposal, Proposer, moved_since
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
-from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, unmeasured
+from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, edge_frame, unmeasured
 from pipeline.inquiry import Inquiry
 from pipeline.line_witness import LineFrame
 from pipeline.mount import Mount
@@ -214,9 +214,10 @@ class Watch:
         else:
             evidence = self._scout.look(pair, stage)
         now_ns = pair.image_stamp_ns
-        if evidence.edge_frame is not None and evidence.straight is not None:
-            self._edge_frames.append(evidence.edge_frame)
-            self._dating.see(evidence.edge_frame)
+        if evidence.edges is not None and evidence.straight is not None:
+            frame = edge_frame(pair, evidence.edges, evidence.straight, self.mount, stage)
+            self._edge_frames.append(frame)
+            self._dating.see(frame)
             self.inquiry.see(now_ns, evidence.straight)
         if evidence.lines is not None:
             self._line_frames.append((now_ns, evidence.lines))

@@ -91,7 +91,8 @@ def updated(mean: Floats, covariance: Floats, scene: Scene, noise: Floats) -> tu
     """Filters after a scene, whose random error has covariance ``noise`` (6,6): Kalman's update.
 
     Returns:
-        Means (n,13), covariances (n,13,13), and how far off each had expected the scene, squared sigmas (n,).
+        Means (n,13), covariances (n,13,13), and how far off each had expected the scene, squared sigmas (n,),
+        counted by the error that the scene itself states.
     """
     f = scene.feigned
     # A scene shows m + s + f tau: sums of columns and rows are a tenth of the work of products with H.
@@ -100,6 +101,7 @@ def updated(mean: Floats, covariance: Floats, scene: Scene, noise: Floats) -> tu
     gain = np.swapaxes(np.linalg.solve(expected, np.swapaxes(seen, 1, 2)), 1, 2)
     off = scene.drift - (mean[:, :6] + mean[:, 6:12] + mean[:, 12:] * f)
     covariance = covariance - gain @ np.swapaxes(seen, 1, 2)
-    squares = np.einsum("ni,ni->n", off, np.linalg.solve(expected, off[..., None])[..., 0])
+    stated = expected + (scene.covariance - noise)
+    squares = np.einsum("ni,ni->n", off, np.linalg.solve(stated, off[..., None])[..., 0])
     mean = mean + (gain @ off[..., None])[..., 0]
     return mean, 0.5 * (covariance + np.swapaxes(covariance, 1, 2)), squares

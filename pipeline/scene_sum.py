@@ -31,6 +31,9 @@ _FARTHEST = np.array([math.radians(10.0)] * 3 + [3.0] * 3)
 _DENSE = 16
 """Beginnings kept of each age: the last 16 all, then every second one to 32 scenes, every fourth to 64..."""
 
+_MOST_SURPRISE = 60.0
+"""Squared sigmas, ten times what is expected: a single false mode shall not make an hour of scenes unsure."""
+
 _OLDEST = 4096
 """Scenes; older beginnings than 80 km are let go, but for the first."""
 
@@ -43,12 +46,13 @@ class SceneSumParameters:
         correlation_m: Way over which the systematic part keeps 1/e of itself: streets in town are 100 to
             300 m long, and too long a way only makes the sum slower.
         most_square: No scene alone is heard for more than this, squared sigmas: chi-square, 6 degrees of
-            freedom, at 1e-3. What is further off is a false mode, or a drift that the next scenes repeat.
+            freedom, at 0.05. What is further off may be a false mode: five of them must agree before they
+            are believed. A drift of that size is repeated by the next scenes, and told by single windows.
         budget: How often a false alarm may come.
     """
 
     correlation_m: float = 300.0
-    most_square: float = 22.46
+    most_square: float = 12.59
     budget: AlarmBudget = field(default_factory=AlarmBudget)
 
 
@@ -165,7 +169,7 @@ def advance(
         noise,
     )
     # The first scene of a stretch surprises nobody: nothing was expected.
-    scatter = np.append(total.scatter + squares[:-1], 0.0)
+    scatter = np.append(total.scatter + np.minimum(squares[:-1], _MOST_SURPRISE), 0.0)
     before = np.concatenate([total.before, before[None]])
     widened = before_covariance * _excess(total.scatter[:1], np.array([total.scenes]))
     before_covariance = np.concatenate([total.before_covariance, widened[None]])

@@ -27,7 +27,7 @@ class TrackParameters:
     walk_rad: float = math.radians(0.1)
     walk_m: float = 0.01
     correlation_m: float = 300.0
-    most_square: float = 22.46
+    most_square: float = 12.59
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,8 +50,8 @@ ROADS = (
     Road("jam", 1.5, 0.5, 400.0, 1.5, 0.3, 400.0, 0.1),
     Road("empty", 18.0, 0.2, 2000.0, 3.0, 0.8, 300.0, 0.05),
 )
-"""A week of driving. Speeds and lengths are those of common roads; where less stands beside one, sigmas grow as
-between good and bad streets (PROBE 3 and 9: two to three times)."""
+"""Speeds and lengths are those of common roads; where less stands beside one, sigmas grow
+as between good and bad streets (PROBE 3 and 9: two to three times)."""
 
 _SYNC_S = 0.003
 """s; one sigma of stamps that hardware sets (pipeline.ego)."""
@@ -61,37 +61,49 @@ _YAW_RATE = 0.05
 
 
 def _typical_covariance() -> Floats:
-    sigma = np.array([math.radians(0.06), math.radians(0.05), math.radians(0.04), 0.02, 0.015, 0.015])
+    sigma = np.array([math.radians(0.12), math.radians(0.10), math.radians(0.07), 0.025, 0.023, 0.025])
     correlation = np.eye(6)
-    # PROBE 3: pitch with up, yaw with left, weaker in one scene than in a window's curvature.
-    correlation[1, 5] = correlation[5, 1] = 0.6
-    correlation[2, 4] = correlation[4, 2] = -0.6
+    correlation[1, 5] = correlation[5, 1] = 0.78
+    correlation[2, 4] = correlation[4, 2] = -0.9
     return np.asarray(correlation * np.outer(sigma, sigma), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvidenceModel:
-    """How the estimates of scenes scatter.
+    """How the estimates of scenes scatter; but for ``street``, defaults are those of ten image-level streets.
 
     Attributes:
         covariance: float64 (6,6), stated for a scene of middling worth, vehicle axes, rad and m.
         worth_spread: Standard deviation of the logarithm of its sigmas between scenes of one road.
         ratio: Sigmas of the true random error over the stated ones.
+        common: Share of the random error's variance that neighbouring scenes have in common: both see what
+            stands further ahead.
+        common_m: Way over which that keeps 1/e of itself.
         freedom: Degrees of freedom of the random error's Student tails.
+        ridden: Share of the streets whose scenes lie in false modes.
+        ridden_ratio: Sigmas of the true random error over the stated ones there.
         street: float64 (6,6), covariance of the systematic part.
         correlation_m: Way over which it keeps 1/e of itself while the street goes on.
     """
 
     covariance: Floats = field(default_factory=_typical_covariance)
-    worth_spread: float = 0.3
+    worth_spread: float = 0.5
     ratio: float = 0.8
-    freedom: float = 6.0
+    common: float = 0.25
+    common_m: float = 100.0
+    freedom: float = 5.0
+    ridden: float = 0.3
+    ridden_ratio: float = 3.6
     street: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     correlation_m: float = 150.0
 
     def __post_init__(self) -> None:
         for name in ("covariance", "street"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def drawn_ratio(self, rng: np.random.Generator) -> float:
+        """Sigmas of the true random error over the stated ones in one street."""
+        return self.ridden_ratio if rng.random() < self.ridden else self.ratio
 
 
 def scenes(
@@ -114,8 +126,9 @@ def scenes(
     noise_root = np.linalg.cholesky(model.covariance)
     shares = np.array([road.share for road in roads])
     tau = float(rng.normal())
-    street = street_root @ rng.normal(size=6)
+    street, ratio = street_root @ rng.normal(size=6), model.drawn_ratio(rng)
     kept = math.exp(-NEW_SCENE_M / model.correlation_m)
+    lasting, alike = rng.normal(size=6), math.exp(-NEW_SCENE_M / model.common_m)
     time, way = 0.0, 0.0
     while time < duration_s:
         road = roads[int(rng.choice(len(roads), p=shares / shares.sum()))]
@@ -125,14 +138,16 @@ def scenes(
             time += NEW_SCENE_M / speed
             way += NEW_SCENE_M
             if rng.random() < NEW_SCENE_M / road.street_m:
-                street = street_root @ rng.normal(size=6)
+                street, ratio = street_root @ rng.normal(size=6), model.drawn_ratio(rng)
             street = kept * street + math.sqrt(1.0 - kept**2) * (street_root @ rng.normal(size=6))
+            lasting = alike * lasting + math.sqrt(1.0 - alike**2) * rng.normal(size=6)
             if rng.random() < road.unseen:
                 continue
             worth = road.worth * math.exp(model.worth_spread * float(rng.normal()))
             feigned = _SYNC_S * np.array([0.0, 0.0, _YAW_RATE * rng.normal(), speed, 0.0, 0.0])
             # Student: the same heavy factor on all axes, as a false mode has.
             tail = math.sqrt((model.freedom - 2.0) / float(rng.chisquare(model.freedom)))
-            error = worth * model.ratio * tail * (noise_root @ rng.normal(size=6))
+            whole = math.sqrt(model.common) * lasting + math.sqrt(1.0 - model.common) * rng.normal(size=6)
+            error = worth * ratio * tail * (noise_root @ whole)
             drift = mount(time) + street + tau * feigned + error
             yield Scene(drift, worth**2 * model.covariance, feigned, way, round(time * 1e9))

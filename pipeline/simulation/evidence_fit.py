@@ -1,11 +1,11 @@
 """The model of ``simulation.evidence`` fitted to estimates of image-level drives, whose truth is known."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 from scipy.stats import chi2
 
 from pipeline.errors import InputError
@@ -15,12 +15,20 @@ from pipeline.scene_filter import Scene
 _LEAST_STREETS = 4
 """Streets; fewer tell nothing of what differs between them."""
 
-_LOG_BOUNDS = (
-    (math.log(0.1), math.log(5.0)),
-    (math.log(1e-3), math.log(5.0)),
-    (math.log(5.0), math.log(2e3)),
-)
-"""Of ratio, share, and correlation in m."""
+_BOUNDS = ((0.05, 5.0), (1e-3, 5.0), (1e-3, 0.99), (5.0, 2000.0))
+"""Of ratio, share, common, and correlation in m."""
+
+_STEP = 0.1
+"""First step of the search for the ends of an interval, in the logarithm; each is half as long again."""
+
+_SEARCH = {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
+
+_START = (0.8, 0.3, 0.3, 60.0)
+"""Where the likeliest are sought from."""
+
+_RIDDEN = 4.0
+"""Mean square error in stated sigmas beyond which the scenes of a street lie in false modes: honest errors of
+three scenes and six axes exceed it once in 1e8 streets."""
 
 _FREEDOMS = np.array([3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 60.0, 200.0])
 """Degrees of freedom that are tried for the tails."""
@@ -32,10 +40,15 @@ class EvidenceFit:
 
     Attributes:
         streets: How many drives.
-        scenes: Their scenes.
+        ridden: How many of them lie in false modes; ratio, share, correlation and tails are of the others.
+        ridden_ratio: Sigmas of the random error over the stated ones in those; 0 where there are none.
+        scenes: Scenes of the others.
         ratio: Sigmas of the random error over the stated ones, and its 90 % interval.
-        share: Sigmas of the systematic part over those of the floor, and its interval.
-        correlation_m: Way over which it keeps 1/e, m, and its interval.
+        share: Sigmas of the systematic part, the same in all scenes of a street, over those of the floor, and
+            its interval.
+        common: Share of the random error's variance that neighbouring scenes have in common, and its
+            interval.
+        correlation_m: Way over which that keeps 1/e, m, and its interval.
         freedom: Degrees of freedom of the tails.
         covariance: float64 (6,6), stated for a scene of middling worth.
         worth_spread: Standard deviation of the logarithm of stated sigmas.
@@ -46,9 +59,12 @@ class EvidenceFit:
     """
 
     streets: int
+    ridden: int
+    ridden_ratio: float
     scenes: int
     ratio: tuple[float, float, float]
     share: tuple[float, float, float]
+    common: tuple[float, float, float]
     correlation_m: tuple[float, float, float]
     freedom: float
     covariance: Floats
@@ -59,7 +75,7 @@ class EvidenceFit:
 
 
 def fit(drives: Sequence[Sequence[Scene]], floor: Floats) -> EvidenceFit:
-    """Maximum likelihood of ratio, share and correlation; intervals by the profile of each.
+    """Maximum likelihood of ratio, share, common and correlation; intervals by the profile of each.
 
     Args:
         drives: Scenes of each drive with an unmoved mount, whose stored extrinsic is the true one.
@@ -70,15 +86,23 @@ def fit(drives: Sequence[Sequence[Scene]], floor: Floats) -> EvidenceFit:
         raise InputError(
             f"{len(drives)} streets are too few to fit how they differ", hint=f"{_LEAST_STREETS} or more"
         )
-    blocks = [_Block(drive, floor) for drive in drives]
+    every = [_Block(drive, floor) for drive in drives]
+    blocks = [block for block in every if block.mean_square() <= _RIDDEN]
+    ridden = [block for block in every if block.mean_square() > _RIDDEN]
+    if not blocks:
+        raise InputError(
+            "every street lies in false modes", hint="look at the drives: is the extrinsic true?"
+        )
 
     def cost(x: Floats) -> float:
         return sum(block.surprise(*np.exp(x)) for block in blocks)
 
-    best = minimize(cost, np.log([1.0, 0.5, 60.0]), method="Nelder-Mead", bounds=_LOG_BOUNDS)
-    intervals = [_interval(cost, best.x, best.fun, index) for index in range(3)]
-    ratio, share, correlation_m = (float(v) for v in np.exp(best.x))
-    squares = np.sort(np.concatenate([block.squares(ratio, share) for block in blocks]))
+    bounds = np.log(_BOUNDS)
+    best = minimize(cost, np.log(_START), method="Nelder-Mead", bounds=_bounds(), options=_SEARCH)
+    middle = [float(value) for value in np.exp(best.x)]
+    found = [(value, *_interval(cost, best.x, best.fun, index, bounds)) for index, value in enumerate(middle)]
+    ratio, share, common, correlation_m = found
+    squares = np.sort(np.concatenate([block.squares(ratio[0], share[0]) for block in blocks]))
     worths = np.array([_log_worth(scene.covariance) for drive in drives for scene in drive])
     middling = np.mean(
         [scene.covariance / math.exp(2.0 * _log_worth(scene.covariance)) for d in drives for scene in d],
@@ -87,10 +111,13 @@ def fit(drives: Sequence[Sequence[Scene]], floor: Floats) -> EvidenceFit:
     lags, correlations = _lags(blocks)
     return EvidenceFit(
         streets=len(drives),
+        ridden=len(ridden),
+        ridden_ratio=math.sqrt(np.mean([block.mean_square() for block in ridden])) if ridden else 0.0,
         scenes=len(squares),
-        ratio=(ratio, *intervals[0]),
-        share=(share, *intervals[1]),
-        correlation_m=(correlation_m, *intervals[2]),
+        ratio=ratio,
+        share=share,
+        common=common,
+        correlation_m=correlation_m,
         freedom=_freedom(squares),
         covariance=middling * math.exp(2.0 * float(np.median(worths))),
         worth_spread=float(np.std(worths)),
@@ -108,21 +135,21 @@ class _Block:
         self.drifts = np.array([scene.drift for scene in drive])
         self.covariances = np.array([scene.covariance for scene in drive])
         self.feigned = np.array([scene.feigned for scene in drive])
+        self.roots = np.linalg.cholesky(self.covariances)
         way = np.array([scene.way_m for scene in drive])
         self.apart = np.abs(way[:, None] - way[None, :])
 
-    def surprise(self, ratio: float, share: float, correlation_m: float) -> float:
+    def surprise(self, ratio: float, share: float, common: float, correlation_m: float) -> float:
         """Minus twice the logarithm of the likelihood, less a constant."""
         n = len(self.drifts)
-        total = np.kron(np.exp(-self.apart / correlation_m), share**2 * self.floor)
-        for index, covariance in enumerate(self.covariances):
-            place = slice(6 * index, 6 * index + 6)
-            total[place, place] += ratio**2 * covariance
+        alike = common * np.exp(-self.apart / correlation_m)
+        np.fill_diagonal(alike, 1.0)
+        shaped = np.einsum("kl,kij,lmj->kilm", ratio**2 * alike, self.roots, self.roots)
         feigned = self.feigned.ravel()
-        total += np.outer(feigned, feigned)
+        total = shaped.reshape(6 * n, 6 * n) + np.outer(feigned, feigned)
+        total += np.kron(np.ones((n, n)), share**2 * self.floor)
         error = self.drifts.ravel()
-        sign, volume = np.linalg.slogdet(total)
-        return float(volume + error @ np.linalg.solve(total, error)) if sign > 0 and n else math.inf
+        return float(np.linalg.slogdet(total)[1] + error @ np.linalg.solve(total, error))
 
     def squares(self, ratio: float, share: float) -> Floats:
         """Squared error of each scene in sigmas, (n,)."""
@@ -131,31 +158,42 @@ class _Block:
         whole = np.linalg.solve(total, self.drifts[..., None])[..., 0]
         return np.asarray(np.einsum("ni,ni->n", self.drifts, whole))
 
+    def mean_square(self) -> float:
+        """Of the errors in stated sigmas, over scenes and axes."""
+        return float(np.mean(self.whitened() ** 2))
+
     def whitened(self) -> Floats:
         """Errors in stated sigmas, (n,6)."""
-        roots = np.linalg.cholesky(self.covariances)
-        return np.asarray(np.linalg.solve(roots, self.drifts[..., None])[..., 0])
+        return np.asarray(np.linalg.solve(self.roots, self.drifts[..., None])[..., 0])
 
 
-def _interval(cost: object, best: Floats, least: float, index: int) -> tuple[float, float]:
+def _interval(
+    cost: Callable[[Floats], float], best: Floats, least: float, index: int, bounds: Floats
+) -> tuple[float, float]:
     """90 % interval of one parameter: where minus twice the log-likelihood rises by chi-square's 2.71."""
-    assert callable(cost)  # noqa: S101 - a closure of fit
-    others = [i for i in range(3) if i != index]
+    others = [i for i in range(len(best)) if i != index]
     ends = []
     for sign in (-1.0, 1.0):
-        value = float(best[index])
-        while _LOG_BOUNDS[index][0] < value < _LOG_BOUNDS[index][1]:
-            value += sign * 0.1
+        value, step = float(best[index]), _STEP
 
-            def held(x: Floats, at: float = value) -> float:
-                full = np.zeros(3)
-                full[others], full[index] = x, at
-                return float(cost(full))
+        def surplus(at: float) -> float:
+            def held(x: Floats) -> float:
+                return cost(np.insert(x, index, at))
 
-            if minimize(held, best[others], method="Nelder-Mead").fun - least > chi2.isf(0.1, 1):
-                break
-        ends.append(math.exp(min(max(value, _LOG_BOUNDS[index][0]), _LOG_BOUNDS[index][1])))
+            return float(
+                minimize(held, best[others], method="Nelder-Mead", bounds=_bounds(others)).fun - least
+            )
+
+        while bounds[index][0] < value < bounds[index][1] and surplus(value) < chi2.isf(0.1, 1):
+            value, step = value + sign * step, 1.5 * step
+        ends.append(math.exp(min(max(value, bounds[index][0]), bounds[index][1])))
     return ends[0], ends[1]
+
+
+def _bounds(places: Sequence[int] = range(4)) -> Bounds:
+    """Of the logarithms of the parameters at these places."""
+    low, high = np.log([_BOUNDS[place] for place in places]).T
+    return Bounds(low, high)
 
 
 def _log_worth(covariance: Floats) -> float:

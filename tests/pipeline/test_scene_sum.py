@@ -72,7 +72,9 @@ def least_squares(drifts: Floats, prior: Floats | None) -> tuple[Floats, Floats]
     covariance: Floats = np.asarray(np.linalg.inv(information), dtype=np.float64)
     mount = covariance @ design.T @ inverse @ drifts.ravel()
     left = drifts.ravel() - design @ mount
-    square = left @ inverse @ left + (0.0 if prior is None else mount @ np.linalg.solve(prior, mount))
+    square = float(left @ inverse @ left)
+    if prior is not None:
+        square += float(mount @ np.linalg.solve(prior, mount))
     scenes = n if prior is not None else n - 1
     return mount, covariance * max(1.0, square / (6.0 * max(scenes, 1)))
 

@@ -126,4 +126,7 @@ def timeline(summary: Summary) -> tuple[tuple[str, ...], bool]:
         f"yaw {drift.yaw.value:+.2f} deg (truth {YAW_DEG:+.2f}), "
         f"left {drift.left.value:+.3f} m (truth {LEFT_M:+.3f})"
     )
+    if (onset := pair.last.onset) is not None:
+        at, first, last = ((stamp - START_NS) / 1e9 for stamp in (onset.stamp_ns, onset.from_ns, onset.to_ns))
+        lines.append(f"dated to {at:.2f} s, between {first:.2f} and {last:.2f} s (truth {DRIFT_S:.2f})")
     return tuple(lines), drifted_s >= DRIFT_S

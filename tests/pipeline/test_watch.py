@@ -354,3 +354,20 @@ def test_up_and_forward_are_those_of_the_vehicle_else_of_the_camera():
     bare = dataclasses.replace(mount, T_vehicle_lidar=None)
     np.testing.assert_allclose(bare.up, -mount.T_cam_lidar[1, :3], atol=1e-12)
     np.testing.assert_allclose(bare.forward, mount.T_cam_lidar[2, :3], atol=1e-12)
+
+
+def test_an_acknowledged_drift_that_is_still_there_is_told_again():
+    parameters, pairs = simulated()
+    watch, states = watched(mount_of(parameters, injected(2, 1.0)), pairs)
+    assert states[-1] == "drifted"
+    first, last = pairs[0].image_stamp_ns, pairs[-1].image_stamp_ns
+    # Wrong from the beginning, and no drive before it.
+    assert watch.memory.onset.stamp_ns == watch.memory.onset.from_ns == first
+    assert watch.acknowledge(last, "Ada", "noted")
+    assert (watch.memory.state, watch.memory.severity, watch.memory.onset) == ("starting", None, None)
+    assert not watch.acknowledge(last, "Ada", "noted")
+    for pair in pairs:
+        later = {name: getattr(pair, name) + S for name in ("cloud_stamp_ns", "image_stamp_ns")}
+        watch.step(dataclasses.replace(pair, **later))
+    assert watch.memory.state == "drifted"
+    assert watch.memory.onset.from_ns >= last

@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -70,6 +70,7 @@ class Measured:
         timing: Stage -> quantiles.
         outputs_lost: Output -> what happened.
         explanation: What the drive says of mount, clock and lens, or None.
+        left: Reason -> frames that left the window.
     """
 
     received: int
@@ -81,6 +82,7 @@ class Measured:
     timing: Mapping[str, Timing]
     outputs_lost: Mapping[str, str]
     explanation: Explanation | None = None
+    left: Mapping[str, int] = field(default_factory=dict)
 
 
 def status_of(
@@ -117,6 +119,7 @@ def status_of(
             lines_lane=_matched(belief, "lane"),
             lines_pole=_matched(belief, "pole"),
             lines_structure=_matched(belief, "structure"),
+            left=dict(measured.left),
         ),
         frames=Frames(received=measured.received, used=measured.used, dropped=dict(measured.dropped)),
         rates=measured.rates,

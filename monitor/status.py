@@ -192,6 +192,10 @@ class Window(_Part):
     lines_lane: NonNegativeInt
     lines_pole: NonNegativeInt
     lines_structure: NonNegativeInt
+    left: dict[Code, NonNegativeInt] = Field(
+        default_factory=dict,
+        description="reason -> frames that left the window since the start: past, aged, repeats, adds_least",
+    )
 
 
 class Frames(_Part):

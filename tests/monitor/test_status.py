@@ -60,7 +60,14 @@ STATUS = {
         }
     ],
     "witnesses": {"lines": {"drift": VALUES, "sigma": VALUES, "chi2": 1.0, "frames": 3}, "edges": None},
-    "window": {"frames": 3, "span_s": 1.0, "lines_lane": 1, "lines_pole": 2, "lines_structure": 0},
+    "window": {
+        "frames": 3,
+        "span_s": 1.0,
+        "lines_lane": 1,
+        "lines_pole": 2,
+        "lines_structure": 0,
+        "left": {"past": 4, "repeats": 1},
+    },
     "frames": {"received": 9, "used": 3, "dropped": {"no_partner": 6}},
     "rates": {"lidar_hz": 10.0, "camera_hz": None, "gap_ms": -2.0, "lines_hz": None, "edges_hz": None},
     "time_offset": {"ms": None, "sigma_ms": None, "separable": False},

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from monitor import commands
-from monitor.commands import evaluate_drift
+from monitor.commands import evaluate_drift, evaluate_run_length
 
 if TYPE_CHECKING:
     from monitor.evaluated_frames import EvaluatedFrames
@@ -25,6 +25,7 @@ def command() -> None:
 
 
 command.add_command(evaluate_drift.command)
+command.add_command(evaluate_run_length.command)
 
 
 @command.command(

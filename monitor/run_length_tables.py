@@ -1,0 +1,65 @@
+"""Run length and delays as Markdown, for people."""
+
+from monitor.run_length_evaluation import Healthy, RunLength, Told, Tracked
+from pipeline.records import AXES
+
+_YEAR_H = 2920.0
+"""h; a year of 8 h days."""
+
+_ANGLES = 3
+
+
+def run_length_text(found: RunLength) -> str:
+    """All tables."""
+    lines = [*_healthy_lines(found.healthy), "", *_told_lines(found.told), "", *_tracked_lines(found.tracked)]
+    return "\n".join([*lines, "", f"Seed {found.seed}."])
+
+
+def _healthy_lines(found: Healthy) -> list[str]:
+    lines = [
+        f"Unmoved mounts: {found.hours:.0f} h in {found.drives} drives, {found.scenes} scenes, "
+        f"{found.alarms} false alarms of the sum.",
+        f"Highest statistic {found.highest:.1f} (whole drives {found.highest_since_start:.1f}), "
+        f"level {found.level:.1f}. {found.windows_above} single scenes exceed their level.",
+        "",
+        "| lowered level | alarms counted | allowed by the level's run length |",
+        "|---|---|---|",
+    ]
+    lines += [f"| {one.level:g} | {one.counted} | {one.allowed:.1f} |" for one in found.lowered]
+    if found.extrapolated_hourly is None:
+        lines += ["", "Hardly a peak is left beyond what one scene may weigh: no tail to extrapolate."]
+    else:
+        middle, low, high = (_YEAR_H * value for value in found.extrapolated_hourly)
+        lines += [
+            "",
+            f"Extrapolated (not counted) from peaks above {found.extrapolated_from:g} to the level: "
+            f"{middle:.2g} false alarms in a vehicle-year of {_YEAR_H:.0f} h, 90 % interval {low:.2g} to {high:.2g}.",
+        ]
+    return lines
+
+
+def _told_lines(told: tuple[Told, ...]) -> list[str]:
+    lines = [
+        "| world | drift | told | alarms before it | median delay | median way |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in told:
+        unit = "deg" if AXES.index(one.axis) < _ANGLES else "m"
+        size = f"{one.axis} {one.size:g} {unit}" + (" a minute" if one.ramp else "")
+        delay = "" if one.seconds is None or one.way_m is None else f"{one.seconds:.0f} s | {one.way_m:.0f} m"
+        lines.append(f"| {one.world} | {size} | {one.told} of {one.runs} | {one.early} | {delay or ' | '} |")
+    return lines
+
+
+def _tracked_lines(tracked: tuple[Tracked, ...]) -> list[str]:
+    lines = [
+        "| world | followed | " + " | ".join(f"{axis} rms (sigma)" for axis in AXES) + " | within 2 sigma |",
+        "|---|---|" + "---|" * len(AXES) + "---|",
+    ]
+    for one in tracked:
+        cells = " | ".join(
+            f"{rms:.3f} ({sigma:.3f}) {'deg' if axis < _ANGLES else 'm'}"
+            for axis, (rms, sigma) in enumerate(zip(one.rms, one.sigma, strict=True))
+        )
+        lines.append(f"| {one.world} | {one.hours:g} h | {cells} | {100 * one.within_two:.0f} % |")
+    return lines

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeline import cameras, edge_witness, se3
+from pipeline import cameras, edge_score, edge_witness, se3
 from pipeline.edge_witness import UNITS, EdgeFrame, EdgeWitnessParameters, batch_of, score, score_only, solve
 from pipeline.edges import CELLS, EdgeParameters, Edges, find_edges
 from pipeline.gradients import COUNTS, LEVELS, ORIENTATIONS, GradientPyramid, gradient_pyramid, sample
@@ -155,6 +155,103 @@ def test_chance_has_no_contrast(window):
     unrelated = [dataclasses.replace(frame, gradients=from_noise) for frame in frames]
     found = solve(batch_of(unrelated, camera, P.most_edges), window[2], FLOOR, P, np.random.default_rng(1))
     assert found.contrast < 0.15
+
+
+@pytest.fixture(scope="module")
+def followed(window):
+    """Two frames solved, then three with what the two left, at a stored extrinsic wrong by half a degree."""
+    frames, camera, T_true = window
+    T_stored = se3.retract(T_true, math.radians(0.5) * np.eye(6)[1])
+    one = solve(batch_of(frames[:2], camera, 10**6), T_stored, FLOOR, P, np.random.default_rng(1))
+    two = solve(
+        batch_of(frames, camera, 10**6), T_stored, FLOOR, P, np.random.default_rng(2), trail=one.trail
+    )
+    return T_stored, one, two
+
+
+def test_a_followed_window_gives_what_one_seen_for_the_first_time_gives(window, followed):
+    frames, camera, _ = window
+    T_stored, _, two = followed
+    fresh = solve(batch_of(frames, camera, 10**6), T_stored, FLOOR, P, np.random.default_rng(1))
+    sigma = np.sqrt(np.diag(fresh.covariance))
+    assert (np.abs(two.xi - fresh.xi) < 0.2 * sigma).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(two.covariance)), sigma, rtol=0.2)
+    for name, tolerance in (("score", 1e-4), ("loss", 0.01), ("contrast", 0.05), ("peak", 1.0)):
+        assert getattr(two, name) == pytest.approx(getattr(fresh, name), abs=tolerance), name
+    assert two.score_stored == fresh.score_stored
+
+
+def test_what_a_frame_adds_is_worked_out_once_and_forgotten_with_it(window, followed):
+    frames, camera, _ = window
+    T_stored, one, two = followed
+    stamps = [frame.stamp_ns for frame in frames]
+    assert set(one.trail.shares) == set(stamps[:2])
+    assert set(two.trail.shares) == set(stamps)
+    for stamp in stamps[:2]:
+        assert two.trail.shares[stamp].by_chance is one.trail.shares[stamp].by_chance
+    last = solve(
+        batch_of(frames[2:], camera, 10**6), T_stored, FLOOR, P, np.random.default_rng(1), trail=two.trail
+    )
+    assert set(last.trail.shares) == {stamps[2]}
+
+
+def test_a_trail_against_another_extrinsic_says_nothing(window, followed):
+    frames, camera, T_true = window
+    batch = batch_of(frames[:1], camera, P.most_edges)
+    a, b = (
+        solve(batch, T_true, FLOOR, P, np.random.default_rng(1), trail=trail)
+        for trail in (None, followed[2].trail)
+    )
+    np.testing.assert_array_equal(a.xi, b.xi)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_curvatures_of_frames_add_up_to_that_of_the_score(window):
+    frames, camera, T = window
+    batch = batch_of(frames, camera, 3000)
+    weights = batch.weights()
+    H = np.tensordot(weights / weights.sum(), edge_score.curvatures(batch, T, P.difference), 1)
+    expected = np.zeros((6, 6))
+    for axis in range(6):
+        step = P.difference * UNITS * np.eye(6)[axis]
+        ahead, behind = (score(batch, se3.retract(T, sign * step), 0)[1] * UNITS for sign in (1, -1))
+        expected[axis] = -(ahead - behind) / (2 * P.difference)
+    np.testing.assert_allclose(H, 0.5 * (expected + expected.T), rtol=1e-6, atol=1e-9)
+
+
+def test_mean_responses_are_those_of_each_frame_alone(window):
+    frames, camera, T = window
+    places = [T, se3.retract(T, 0.03 * np.ones(6))]
+    batch = batch_of(frames, camera, 10**6)
+    found = edge_score.mean_responses(batch, places)
+    for k, frame in enumerate(frames):
+        alone = batch_of([frame], camera, 10**6)
+        np.testing.assert_allclose(found[k], [score(alone, place, 0)[0] for place in places], rtol=1e-9)
+        picked = batch.of_frames([k])
+        np.testing.assert_array_equal(picked.position, alone.position)
+        assert score(picked, T, 0)[0] == pytest.approx(score(alone, T, 0)[0])
+
+
+def test_information_of_a_frame_is_positive_and_grows_with_what_it_shows(window):
+    frames, camera, T = window
+    whole = edge_witness.information_of(frames[0], camera, T)
+    np.testing.assert_allclose(whole, whole.T, rtol=1e-6, atol=1e-9 * np.abs(whole).max())
+    assert np.linalg.eigvalsh(whole).min() >= 0
+    left = frames[0].edges.cell % 16 < 5
+    some = Edges(**{name: getattr(frames[0].edges, name)[left] for name in Edges.__slots__})
+    part = edge_witness.information_of(dataclasses.replace(frames[0], edges=some), camera, T)
+    assert np.linalg.slogdet(np.eye(6) + part)[1] < np.linalg.slogdet(np.eye(6) + whole)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_two_degrees_and_a_third_of_a_metre_on_every_axis_are_found_back(window, solved, seed):
+    frames, camera, T_true = window
+    signs = np.random.default_rng(seed).choice([-1, 1], 6)
+    T_stored = se3.retract(T_true, signs * np.array([math.radians(2.0)] * 3 + [0.3] * 3))
+    found = solve(batch_of(frames, camera, P.most_edges), T_stored, FLOOR, P, np.random.default_rng(1))
+    again = se3.local(se3.retract(T_true, solved.xi), se3.retract(T_stored, found.xi))
+    assert np.abs(again / UNITS).max() < 0.2
 
 
 def wide_pyramid(seed, width=120, height=90):

@@ -128,5 +128,5 @@ def timeline(summary: Summary) -> tuple[tuple[str, ...], bool]:
     )
     if (onset := pair.last.onset) is not None:
         at, first, last = ((stamp - START_NS) / 1e9 for stamp in (onset.stamp_ns, onset.from_ns, onset.to_ns))
-        lines.append(f"dated to {at:.2f} s, between {first:.2f} and {last:.2f} s (truth {DRIFT_S:.2f})")
+        lines[-1] += f"; dated to {at:.2f} s, between {first:.2f} and {last:.2f} s (truth {DRIFT_S:.2f})"
     return tuple(lines), drifted_s >= DRIFT_S

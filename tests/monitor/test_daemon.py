@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from monitor.daemon import extrinsic_hash, mount_of, watch, watching
-from monitor.events import EndEvent, FrameEvent, StatusEvent
+from monitor.events import EndEvent, FrameEvent, ProposalEvent, StatusEvent
 from monitor.messages import Message
 from monitor.outputs import Outputs
 from monitor.preparation import prepare
@@ -195,3 +195,22 @@ def test_a_mount_needs_intrinsics_and_an_extrinsic(rig):
     camera = dataclasses.replace(pair.camera, model=None)
     with pytest.raises(RigError, match="pair camera has no intrinsics"):
         mount_of(dataclasses.replace(pair, camera=camera))
+
+
+def test_two_pairs_that_drift_alike_end_with_proposals_and_a_moved_lidar(rig, messages):
+    (front,) = rig.pairs
+    both = dataclasses.replace(rig, pairs=(front, dataclasses.replace(front, name="second")))
+    state, told, _ = watched(both, items(drives.first_frames(messages, 18)))
+    assert state == "drifted"
+    proposals = {event.pair: event for event in told.events if isinstance(event, ProposalEvent)}
+    assert proposals.keys() == {front.name, "second"}
+    for name, event in proposals.items():
+        assert event.document is not None, event.reason
+        assert (event.document.pair, event.document.replaces.hash) == (
+            name,
+            extrinsic_hash(front.T_cam_lidar),
+        )
+        assert event.document.drift.yaw == pytest.approx(1.0, abs=0.3)
+    (parts,) = told.end.parts
+    assert (parts.lidar, parts.pairs) == (CLOUD_TOPIC, (front.name, "second"))
+    assert parts.hypotheses[0].kind == "lidar"

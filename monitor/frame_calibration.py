@@ -23,8 +23,8 @@ from pipeline.mount import Mount
 from pipeline.no_prior import FoundExtrinsic, find_extrinsic
 from pipeline.parameters import Parameters
 from pipeline.records import CloudLine, Floats
-from pipeline.rings import sensor_origin
 from pipeline.segmentation import Segmenter
+from pipeline.sensor_seat import sensor_origin
 
 
 @dataclass(slots=True)

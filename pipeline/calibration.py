@@ -30,8 +30,8 @@ from pipeline.mount import Mount
 from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, Floats, FramePair, PointCloud, read_only
-from pipeline.rings import SensorSeat, sensor_seat
 from pipeline.segmentation import Segmenter, grid_scale
+from pipeline.sensor_seat import SensorSeat, sensor_seat
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,7 @@ def find_lanes(
         ground: Its ground.
         seen: bool (N,), points that may take part (those in view of the camera).
         rng: Draws the pairs.
-        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``sensor_seat``); None: at
             its origin.
 
     Returns:

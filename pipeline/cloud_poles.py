@@ -74,7 +74,7 @@ def find_poles(
         cloud: The sweep.
         ground: Its ground plane.
         seen: bool (N,), points that may take part (those in view of the camera).
-        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``sensor_seat``); None: at
             its origin.
 
     Returns:

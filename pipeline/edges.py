@@ -134,9 +134,9 @@ def find_edges(
         camera: Intrinsics.
         T_cam_lidar: float64 (4,4), the stored extrinsic.
         parameters: What counts as an edge.
-        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``sensor_seat``); None: at
             its origin.
-        axis: float64 (3,), unit, about which it spins (``rings.sensor_seat``); None: an axis of that frame.
+        axis: float64 (3,), unit, about which it spins (``sensor_seat``); None: an axis of that frame.
     """
     T_lidar_sensor = _seated(origin, axis)
     if T_lidar_sensor is not None:

@@ -23,8 +23,8 @@ from pipeline.masks import horizon_line, masks_from_probabilities
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
-from pipeline.rings import SensorSeat, sensor_seat
 from pipeline.segmentation import Segmenter, grid_scale
+from pipeline.sensor_seat import SensorSeat, sensor_seat
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
 """Measures what is done inside it, under a name."""

@@ -28,7 +28,7 @@ from pipeline.records import (
     PointCloud,
     WitnessEstimate,
 )
-from pipeline.rings import sensor_origin
+from pipeline.sensor_seat import sensor_origin
 from pipeline.structure_lines import cloud_lines, find_structure_lines
 
 PRIOR_SIGMA = np.array([np.radians(1.0)] * 3 + [0.15] * 3)

@@ -44,7 +44,6 @@ from pipeline.records import (
     PointCloud,
     read_only,
 )
-from pipeline.rings import sensor_origin
 from pipeline.semantic_cost import (
     EvolutionParameters,
     SemanticPoints,
@@ -53,6 +52,7 @@ from pipeline.semantic_cost import (
     points_of_lines,
     semantic_cost,
 )
+from pipeline.sensor_seat import sensor_origin
 
 Reason: TypeAlias = Literal[
     "no ground plane in the cloud",

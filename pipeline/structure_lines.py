@@ -46,7 +46,7 @@ def find_structure_lines(
         cloud: The sweep, in any LiDAR frame, with or without rings.
         seen: bool (N,), points that may take part (those in view of the camera).
         rng: Draws the borders of planes.
-        origin: float64 (3,), where the sensor stands in the cloud's frame (``rings.sensor_origin``); None: at
+        origin: float64 (3,), where the sensor stands in the cloud's frame (``sensor_seat``); None: at
             its origin.
 
     Returns:

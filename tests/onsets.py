@@ -24,7 +24,7 @@ from pipeline.ground import fit_ground
 from pipeline.mount import Mount
 from pipeline.onset import Onset, change_point
 from pipeline.records import AXES, Floats, FramePair
-from pipeline.rings import sensor_origin
+from pipeline.sensor_seat import sensor_origin
 from pipeline.simulation.drive import Drive, DriveParameters
 from pipeline.traces import TraceParameters, fractions, spread, thinned
 from tests.results import _pairs

@@ -15,7 +15,7 @@ from pipeline.image_lines import MOST_PIECES, find_image_lines
 from pipeline.image_segments import find_image_segments
 from pipeline.line_witness import find_lines, in_view, solve_lines
 from pipeline.records import CameraImage, CameraModel, Masks, PointCloud
-from pipeline.rings import sensor_origin
+from pipeline.sensor_seat import sensor_origin
 from pipeline.structure_lines import find_structure_lines
 
 

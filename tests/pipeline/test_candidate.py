@@ -29,7 +29,7 @@ from pipeline.mount import Mount
 from pipeline.onset import Onset
 from pipeline.parameters import Parameters
 from pipeline.records import CameraModel, FramePair
-from pipeline.rings import sensor_origin
+from pipeline.sensor_seat import sensor_origin
 from pipeline.simulation.drive import Drive, DriveParameters
 from pipeline.simulation.lidar import spinning
 from pipeline.simulation.scene import SceneParameters

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline import rings, se3
 from pipeline.records import PointCloud
-from pipeline.rings import scan_pattern, sensor_origin
+from pipeline.rings import scan_pattern
 from pipeline.simulation.lidar import spinning, sweep
 
 DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -225,7 +225,7 @@ def kitti():
 def test_kitti_sweeps_have_64_rings_of_their_order():
     for path in kitti():
         xyz = np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
-        ring = rings._rings(PointCloud(np.ascontiguousarray(xyz[xyz.any(axis=1)])))  # noqa: SLF001
+        ring = rings.ring_numbers(PointCloud(np.ascontiguousarray(xyz[xyz.any(axis=1)])))
         assert len(np.unique(ring[ring >= 0])) == 64, path.name
 
 
@@ -244,60 +244,3 @@ def test_elevations_tell_the_rings_that_the_file_names_or_nothing(name):
         assert found is None
         return
     assert same_rings(found.ring, cloud.ring[found.index]) > 0.99
-
-
-@pytest.mark.parametrize("shift", [(1.2, -0.4, 1.7), (-0.9, 0.0, 0.3), (0.0, 0.0, 1.8)])
-def test_where_the_sensor_stands_is_found_in_a_cloud_of_the_vehicle(cloud, shift):
-    moved = dataclasses.replace(cloud, xyz=(cloud.xyz + np.array(shift)).astype(np.float32))
-    np.testing.assert_allclose(sensor_origin(moved), shift, atol=0.1)
-
-
-def test_a_sensor_at_its_own_origin_and_a_cloud_without_rings_are_left_alone(cloud):
-    assert not sensor_origin(cloud).any()
-    some = np.random.default_rng(0).normal(0.0, 5.0, (3000, 3)).astype(np.float32)
-    assert not sensor_origin(PointCloud(some)).any()
-
-
-@pytest.mark.parametrize(
-    ("shift", "tilt_deg", "yaw_deg"),
-    [
-        ((0.0, 0.0, 0.0), (1.0, -0.8), 0.5),
-        ((0.12, -0.2, 0.1), (1.0, -0.8), 0.5),
-        ((0.12, -0.2, 0.1), (3.0, 1.5), 80.0),
-        ((1.2, -0.4, 1.7), (1.0, -0.8), 0.5),
-        ((1.2, -0.4, 1.7), (0.3, 0.0), 0.0),
-    ],
-)
-def test_how_a_sensor_sits_is_found_in_a_cloud_that_was_turned_and_moved(cloud, shift, tilt_deg, yaw_deg):
-    R = Rotation.from_rotvec([*tilt_deg, 0.0], degrees=True) * Rotation.from_euler("z", yaw_deg, degrees=True)
-    R = R.as_matrix()
-    T = se3.transform(R, np.array(shift))
-    seat = rings.sensor_seat(dataclasses.replace(cloud, xyz=se3.apply(T, cloud.xyz).astype(np.float32)))
-    np.testing.assert_allclose(seat.origin, shift, atol=0.06)
-    assert np.degrees(np.arccos(min(1.0, seat.axis @ R[:, 2]))) < 0.1
-
-
-def test_a_sensor_that_sits_straight_spins_about_the_axis_of_its_frame(cloud):
-    seat = rings.sensor_seat(cloud)
-    assert not seat.origin.any()
-    assert np.array_equal(seat.axis, [0.0, 0.0, 1.0])
-
-
-def test_the_slopes_of_the_rings_are_those_of_differences(cloud):
-    p = cloud.xyz[::400].astype(float)
-    group = np.sort(np.arange(len(p)) % 7)
-    error, J = rings._cone_errors(p, group)  # noqa: SLF001 - the oracle is of this function
-
-    def moved(step):
-        # The median slope of a ring moves with the apex too; held, as the Gauss-Newton step holds it.
-        q = (p - step[:3]) @ se3.exp_so3(np.array([step[3], step[4], 0.0])).T
-        rho0 = np.hypot(p[:, 0], p[:, 1])
-        k = np.array([np.median((p[:, 2] / rho0)[group == g]) for g in range(7)])[group]
-        reach = np.hypot(rho0, p[:, 2]) * np.sqrt(1 + k * k)
-        raw = (q[:, 2] - k * np.hypot(q[:, 0], q[:, 1])) / reach
-        means = np.array([raw[group == g].mean() for g in range(7)])
-        return raw - means[group]
-
-    np.testing.assert_allclose(moved(np.zeros(5)), error, atol=1e-12)
-    for i, step in enumerate(1e-6 * np.eye(5)):
-        np.testing.assert_allclose(J[:, i], (moved(step) - moved(-step)) / 2e-6, atol=1e-6)

@@ -100,6 +100,11 @@ class Watch:
         self.departed: Counter[window.Departure] = Counter()
 
     @property
+    def edge_frames(self) -> tuple[EdgeFrame, ...]:
+        """The window's frames with edges, ascending in time."""
+        return tuple(self._edge_frames)
+
+    @property
     def window_stamps(self) -> tuple[int, ...]:
         """Stamps of the frames in the window, ns."""
         return tuple(frame.stamp_ns for frame in self._edge_frames)

@@ -1,6 +1,7 @@
 """``python -m tests.bench [RECORDING...]``: tables in Markdown on stdout.
 
-Without arguments a simulated drive is measured, and kitti_raw_0005_a where the recordings folder is there.
+Without arguments a simulated drive is measured, and kitti_raw_0005_a where the recordings folder is there; a
+longer simulated drive is replayed. ``--replay RECORDING...`` replays only.
 Each number of threads has a process of its own: BLAS asks for it once, when it is loaded.
 """
 
@@ -10,14 +11,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.bench import drive, environment
+from tests.bench import drive, environment, replay
 from tests.bench.lines import TARGETS_MS
 from tests.bench.stages import Measured, measure
 
 THREADS = (1, 2)
 _RECORDINGS = Path(os.environ.get("CALIBWATCH_DATA") or Path(__file__).parents[3] / "shared" / "data")
 _REAL = _RECORDINGS / "kitti_raw_0005_a"
-_WORKER = "--worker"
+_WORKER, _REPLAY, _REPLAYER = "--worker", "--replay", "--replayer"
 _LEGEND = (
     "Process time of all threads / wall time, ms; median of the calls, for motion (every third sweep is "
     "registered) the mean. A frame: at 10 Hz, with masks and lines at 2 Hz and a judgement a second."
@@ -30,27 +31,47 @@ def main(arguments: list[str]) -> None:
         threads, location = arguments[1:]
         sys.stdout.write(json.dumps(measure(location, int(threads))))
         return
+    if arguments[:1] == [_REPLAYER]:
+        sys.stdout.write(json.dumps(replay.measure(arguments[1])))
+        return
+    if arguments[:1] == [_REPLAY]:
+        _tell(_replays(arguments[1:]))
+        return
     recordings = arguments or [str(drive.simulated()), *([str(_REAL)] if _REAL.is_dir() else [])]
     for location in recordings:
         runs = {threads: _run(location, threads) for threads in THREADS}
         _tell(_stages(Path(location).name, runs))
         _tell(_lines(runs[THREADS[0]]))
         _tell(_ratios(runs[THREADS[0]]))
+    _tell(_replays(arguments or [str(drive.simulated(drive.LONG_S))]))
     _tell(environment.tables())
 
 
 def _run(location: str, threads: int) -> Measured:
     """Measures in a process with so many threads."""
     sys.stderr.write(f"{location}, threads: {threads}\n")
+    found: Measured = json.loads(_answer([_WORKER, str(threads), location], threads))
+    return found
+
+
+def _replays(locations: list[str]) -> str:
+    """Replays recordings, each in a process of its own with one thread of BLAS, as the Makefile sets it."""
+    found: dict[str, replay.Replayed] = {}
+    for location in locations:
+        sys.stderr.write(f"{location}, replay\n")
+        found[Path(location).name] = json.loads(_answer([_REPLAYER, location], 1))
+    return replay.table(found)
+
+
+def _answer(arguments: list[str], threads: int) -> bytes:
     count = str(threads)
-    answer = subprocess.run(  # noqa: S603 - this file, by the interpreter that runs it
-        [sys.executable, "-m", "tests.bench", _WORKER, count, location],
+    told = subprocess.run(  # noqa: S603 - this file, by the interpreter that runs it
+        [sys.executable, "-m", "tests.bench", *arguments],
         env=os.environ | {"OMP_NUM_THREADS": count, "OPENBLAS_NUM_THREADS": count},
         stdout=subprocess.PIPE,
         check=True,
     )
-    found: Measured = json.loads(answer.stdout)
-    return found
+    return told.stdout
 
 
 def _stages(name: str, runs: dict[int, Measured]) -> str:

@@ -34,10 +34,13 @@ STAGES = {
     "ground": 1.0,
     "edges": 1.0,
     "gradients": 1.0,
+    "information": 1.0,
     "network": 0.2,
     "masks": 0.2,
     "lines": 0.2,
     "judgement": 0.1,
+    "inquiry": 0.1,
+    "proposal": 0.1,
 }
 """Stages and how often each runs per frame: 10 Hz, masks and lines at 2 Hz, a judgement a second."""
 

@@ -90,7 +90,7 @@ class Pair:
         yes = np.ones(6, dtype=bool)
         told = {"alarming": alarming, "suspicious": alarming, "blind": False, "contradicted": False} | marks
         judgement = Judgement(drift, sigma, sigma, sigma, yes, yes, yes, 50.0, **told)
-        evidence = Evidence(drift, np.diag(sigma**2), 0.2, 1.0, 9.0, persistent=True, frames=20)
+        evidence = Evidence(drift, np.diag(sigma**2), 0.2, 1.0, 9.0, 4.0, persistent=True, frames=20)
         belief = Belief(judgement, evidence, T_now, None, None, None, None, ())
         self.memory = dataclasses.replace(self.memory, input_ns=now_ns, severity=severity)
         before = self.memory

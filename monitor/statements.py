@@ -32,6 +32,7 @@ from pipeline.consequence import consequences
 from pipeline.fusion import Testimony
 from pipeline.mount import Mount
 from pipeline.records import Floats
+from pipeline.window import Departure
 
 TO_PEOPLE = np.array([180.0 / math.pi] * 3 + [1.0] * 3)
 """rad, m -> deg, m."""
@@ -82,7 +83,7 @@ class Measured:
     timing: Mapping[str, Timing]
     outputs_lost: Mapping[str, str]
     explanation: Explanation | None = None
-    left: Mapping[str, int] = field(default_factory=dict)
+    left: Mapping[Departure, int] = field(default_factory=dict)
 
 
 def status_of(

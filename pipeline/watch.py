@@ -5,7 +5,6 @@ Pure: no files, no clock. What a stage costs is measured by the caller through `
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from pipeline.belief import Belief, believe
 from pipeline.candidate import Proposal, Proposer, moved_since
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
+from pipeline.edge_witness import EdgeFrame
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, edge_frame, unmeasured
 from pipeline.inquiry import Inquiry
 from pipeline.line_witness import LineFrame
@@ -23,9 +23,6 @@ from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.scene_filter import Scene
 from pipeline.segmentation import Segmenter
-
-if TYPE_CHECKING:
-    from pipeline.edge_witness import EdgeFrame
 
 _SCENE_STAMPS = 1024
 """Scenes whose stamps are kept: 20 km; a drift that began before is told to have begun before the data."""

@@ -21,6 +21,8 @@ _TITLES: dict[Kind, str] = {
 }
 """Of the kinds that have a table label by label."""
 
+_NOTHING_MOVED = ("vibration", "time-offset", "focal")
+
 
 def drift_text(found: Summary) -> str:
     """All tables."""
@@ -150,7 +152,9 @@ def _cells(kind: Kind, cells: Sequence[Cell]) -> Iterator[str]:
     yield "| drive | what | runs | told | at the end | until told, s | T |"
     yield "|---|---|---|---|---|---|---|"
     for cell in cells:
-        states = ", ".join(f"{n} {state}" for state, n in sorted(cell.states.items()))
+        # Where nothing moved the reason tells whether the cause was named.
+        ends = cell.codes if kind in _NOTHING_MOVED else cell.states
+        states = ", ".join(f"{n} {end}" for end, n in sorted(ends.items()))
         delay = "-" if cell.delay_s is None else f"{cell.delay_s:.1f}"
         statistic = "-" if cell.statistic is None else f"{cell.statistic:.0f}"
         yield (

@@ -157,7 +157,7 @@ def test_everything_is_shown(tmp_path):
         "| a | 1 | 1 | 1 | 0 (0 to 98 %) | 1 (3 to 100 %) | 0 (0 to 98 %) | 100.0 % (1 to 100) |",
         "| recorded | yaw | 0/1 | 0/1 | 1/1 | 1/1 | 0.5 deg | 0.5 deg |",
         "| a | up | 0/1 | 0/1 | 1/1 | 1/1 | 0.1 m | 0.1 m |",
-        "| recorded | +1 % | 1 | 1/1 | 1 drifted | 0.5 | - |",
+        "| recorded | +1 % | 1 | 1/1 | 1 drift_confirmed | 0.5 | - |",
     ):
         assert line in text
     assert "nan" not in text.lower()

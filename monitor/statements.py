@@ -120,7 +120,7 @@ def status_of(
             lines_lane=_matched(belief, "lane"),
             lines_pole=_matched(belief, "pole"),
             lines_structure=_matched(belief, "structure"),
-            left=dict(measured.left),
+            left=dict(measured.left.items()),
         ),
         frames=Frames(received=measured.received, used=measured.used, dropped=dict(measured.dropped)),
         rates=measured.rates,

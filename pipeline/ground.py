@@ -61,6 +61,9 @@ DENSE_SHARE = 0.5
 _FURTHER_TRIES = 6
 """Further planes with most cells that are asked whether they go on from the ground."""
 
+_PLANES_AT_A_TIME = 64
+"""Planes whose bands are counted together: their heights stay in the cache, six times quicker than all."""
+
 _REFITS = 3
 """Least-squares rounds; the second moves the plane by millimetres, the third by less than one."""
 
@@ -246,8 +249,8 @@ class _Known:
 
 def _further_plane(rest: Floats, known: _Known, up: Floats, rng: np.random.Generator) -> Floats | None:
     """The plane (4,) with most cells (M,3) side by side that goes on from the ground."""
-    planes, support = _hypotheses(rest, up, rng)
-    count = _counts(support)
+    planes = _hypotheses(rest, up, rng)
+    count = _counts(rest, planes)
     order = np.argsort(count, kind="stable")[::-1][:_FURTHER_TRIES]
     if len(order) == 0 or count[order[0]] < MIN_FURTHER_CELLS:
         return None
@@ -255,7 +258,7 @@ def _further_plane(rest: Floats, known: _Known, up: Floats, rng: np.random.Gener
     crowd = beside.sum(axis=1)
     best, most = None, MIN_FURTHER_CELLS - 1
     for k in order.tolist():
-        on = support[:, k]
+        on = np.abs(rest @ planes[k, :3] + planes[k, 3]) <= BAND_M / 2
         dense = on & (beside @ on.astype(np.float32) >= DENSE_SHARE * crowd)
         if int(dense.sum()) <= most:
             continue
@@ -350,19 +353,29 @@ def _cell_means(points: Floats, cell: NDArray[np.int64], chosen: NDArray[np.bool
 
 def _best_plane(points: Floats, up: Floats, rng: np.random.Generator) -> Floats | None:
     """The plane (4,) through three of the points (M,3) with most in its band; None if all are steep."""
-    planes, support = _hypotheses(points, up, rng)
+    planes = _hypotheses(points, up, rng)
     if len(planes) == 0:
         return None
-    return np.asarray(planes[int(np.argmax(_counts(support)))])
+    return np.asarray(planes[int(np.argmax(_counts(points, planes)))])
 
 
-def _counts(support: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Number of points (H,) in the band of each plane, of a table (M,H): a product is quicker than a sum."""
-    return np.ones(len(support), dtype=np.float32) @ support.astype(np.float32)
+def _counts(points: Floats, planes: Floats) -> NDArray[np.float32]:
+    """Number (H,) of the points (M,3) in the band of each plane (H,4)."""
+    counts = np.empty(len(planes), dtype=np.float32)
+    one = np.ones(len(points), dtype=np.float32)
+    for first in range(0, len(planes), _PLANES_AT_A_TIME):
+        block = planes[first : first + _PLANES_AT_A_TIME]
+        height = block[:, :3] @ points.T
+        height += block[:, 3:]
+        # A product is quicker than a sum of truth values.
+        counts[first : first + len(block)] = (np.abs(height, out=height) <= BAND_M / 2).astype(
+            np.float32
+        ) @ one
+    return counts
 
 
-def _hypotheses(points: Floats, up: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Level planes (H,4) through three of the points (M,3), and which points lie in their bands (M,H)."""
+def _hypotheses(points: Floats, up: Floats, rng: np.random.Generator) -> Floats:
+    """Level planes (H,4) through three of the points (M,3)."""
     triple = points[rng.integers(0, len(points), (HYPOTHESES, 3))]
     normal = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -372,9 +385,7 @@ def _hypotheses(points: Floats, up: Floats, rng: np.random.Generator) -> tuple[F
     level &= length > CELL_M * CELL_M / 4
     normal = normal[level] * (np.sign(along_up[level]) / length[level])[:, None]
     offset = -np.einsum("ij,ij->i", normal, triple[level, 0])
-    height = points @ normal.T
-    height += offset
-    return np.column_stack([normal, offset]), np.abs(height, out=height) <= BAND_M / 2
+    return np.column_stack([normal, offset])
 
 
 def _least_squares(points: Floats, up: Floats) -> Floats:

@@ -7,12 +7,12 @@ import numpy as np
 
 from pipeline import se3
 from pipeline.belief import Belief
-from pipeline.causes import CauseParameters, Explanation, Section, explain
+from pipeline.causes import Cause, CauseParameters, Explanation, Section, explain
 from pipeline.edge_score import EdgeFrame
 from pipeline.ego import Straightened
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
-from pipeline.records import Floats
+from pipeline.records import CameraModel, Floats
 from pipeline.sections import Move, Passage, Place, fresh, linearised
 from pipeline.verdict import Doubt, Memory
 
@@ -79,7 +79,10 @@ class Inquiry:
         else:
             self._window = self._asked_ns = None
         self._explain(memory, stirred=stirred or memory.severity is not None)
-        return self._doubt(stirred=stirred, claimed=claimed)
+        if self.explanation is None:
+            return None
+        settings = self._parameters.causes
+        return doubt_of(self.explanation, self._mount, settings, stirred=stirred, claimed=claimed)
 
     def _close(self, window: Sequence[Passage], xi: Floats) -> None:
         """Keeps the newest frames as a section of their own once they make one."""
@@ -125,33 +128,46 @@ class Inquiry:
             zoom=self._parameters.causes.zoom,
         )
 
-    def _doubt(self, *, stirred: bool, claimed: bool) -> Doubt | None:
-        found, settings = self.explanation, self._parameters.causes
-        if found is None:
-            return None
-        if not stirred:
-            return self._unnoticed(found, settings)
-        cause = found.cause(settings)
-        if cause == "mount" or (cause == "cause_open" and not claimed):
-            return None
-        return Doubt(cause, REASONS[cause].format(**_sizes(found)))
 
-    def _unnoticed(self, found: Explanation, settings: CauseParameters) -> Doubt | None:
-        """What surely changed and matters, though no window alone shows it."""
-        limits = self._mount.limits
-        late = abs(found.time_offset_s) * found.motion
-        if found.changed("clock", settings) and found.separable and bool(np.any(late > limits)):
-            return Doubt("time_offset", REASONS["time_offset"].format(**_sizes(found)))
-        if found.changed("lens", settings) and abs(found.zoom) * self._border() > float(limits[1:3].min()):
-            return Doubt("intrinsics_changed", REASONS["intrinsics_changed"].format(**_sizes(found)))
+def doubt_of(
+    found: Explanation, mount: Mount, parameters: CauseParameters, *, stirred: bool, claimed: bool
+) -> Doubt | None:
+    """What an explanation has against a moved mount.
+
+    Args:
+        found: What the sections say.
+        mount: What is stored of the pair.
+        parameters: Thresholds.
+        stirred: Whether there is suspicion.
+        claimed: Whether the evidence is to be called a drift.
+
+    Returns:
+        Another cause, or that it is open; while nothing stirs, a clock or lens that surely changed and
+        matters, though no window alone shows it.
+    """
+    if not stirred:
+        return _unnoticed(found, mount, parameters)
+    cause = found.cause(parameters)
+    if cause == "mount" or (cause == "cause_open" and not claimed):
         return None
+    return _told(cause, found)
 
-    def _border(self) -> float:
-        """Angle, rad, by which a ray at the left or right border turns per unit of log focal length."""
-        camera = self._mount.camera
-        f, centre = float(camera.K[0, 0]), float(camera.K[0, 2])
-        slope = max(centre, camera.width - 1 - centre) / f
-        return slope / (1.0 + slope**2)
+
+def _unnoticed(found: Explanation, mount: Mount, parameters: CauseParameters) -> Doubt | None:
+    late = abs(found.time_offset_s) * found.motion
+    if found.changed("clock", parameters) and found.separable and bool(np.any(late > mount.limits)):
+        return _told("time_offset", found)
+    turned = abs(found.zoom) * _border(mount.camera)
+    if found.changed("lens", parameters) and turned > float(mount.limits[1:3].min()):
+        return _told("intrinsics_changed", found)
+    return None
+
+
+def _border(camera: CameraModel) -> float:
+    """Angle, rad, by which a ray at the left or right border turns per unit of log focal length."""
+    f, centre = float(camera.K[0, 0]), float(camera.K[0, 2])
+    slope = max(centre, camera.width - 1 - centre) / f
+    return slope / (1.0 + slope**2)
 
 
 REASONS = {
@@ -166,11 +182,12 @@ REASONS = {
 """What is said of each cause but the mount."""
 
 
-def _sizes(found: Explanation) -> dict[str, float]:
-    return {
+def _told(cause: Cause, found: Explanation) -> Doubt:
+    sizes = {
         "delay": 1e3 * found.time_offset_s,
         "delay_sigma": 1e3 * found.time_sigma_s,
         "alone": 1e3 * found.time_alone_s,
         "zoom": 1e2 * found.zoom,
         "zoom_sigma": 1e2 * found.zoom_sigma,
     }
+    return Doubt(cause, REASONS[cause].format(**sizes))

@@ -1,12 +1,14 @@
 import dataclasses
 import functools
 import math
+import typing
 
 import numpy as np
 import pytest
 
 from pipeline import inquiry as module
-from pipeline import verdict
+from pipeline import se3, verdict
+from pipeline.causes import Cause, CauseParameters, Explanation
 from pipeline.drift_trials import turned_image
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
@@ -36,11 +38,10 @@ def drive(frames):
         lidar=spinning(64, 900),
         camera=CAMERA,
     )
-    pairs = [
+    return [
         FramePair("front", f.cloud, f.image, f.cloud_stamp_ns, f.image_stamp_ns, 0.1)
         for f in Drive(parameters)
     ]
-    return parameters, pairs
 
 
 def shaken(pair, hertz):
@@ -50,23 +51,27 @@ def shaken(pair, hertz):
     return dataclasses.replace(pair, image=CameraImage(turned_image(pair.image.pixels, CAMERA, turn)))
 
 
-def watched(frames=12, *, delay_ms=0, focal=1.0, drift=None, hertz=None):
-    """A watch that has seen the drive with stamps, lens, extrinsic or mount made wrong; its states."""
-    parameters, pairs = drive(frames)
-    K = parameters.camera.K.copy()
+def mount_of(focal=1.0, drift=None):
+    """What is stored, with a focal length and an extrinsic made wrong."""
+    K = CAMERA.K.copy()
     K[:2, :2] /= focal
-    T = parameters.T_stored
-    if drift is not None:
-        T = module.se3.stored_before(T, drift, parameters.T_vehicle_lidar[:3, :3])
-    mount = Mount(
-        camera=dataclasses.replace(parameters.camera, K=K),
-        T_cam_lidar=T,
-        T_vehicle_lidar=parameters.T_vehicle_lidar,
+    rig = DriveParameters()
+    drift = np.zeros(6) if drift is None else drift
+    return Mount(
+        camera=dataclasses.replace(CAMERA, K=K),
+        T_cam_lidar=se3.stored_before(rig.T_stored, drift, rig.T_vehicle_lidar[:3, :3]),
+        T_vehicle_lidar=rig.T_vehicle_lidar,
         sigma_rad=math.radians(0.03),
         sigma_m=0.01,
         limits=LIMITS,
         required=("pitch", "yaw"),
     )
+
+
+def watched(frames=12, *, delay_ms=0, focal=1.0, drift=None, hertz=None):
+    """A watch that has seen the drive with stamps, lens, extrinsic or mount made wrong; its states."""
+    pairs = drive(frames)
+    mount = mount_of(focal, drift)
     watch, states = Watch(mount, Parameters(), None), []
     for pair in pairs:
         stamp_ns = pair.image_stamp_ns - delay_ms * 1_000_000
@@ -157,6 +162,70 @@ def test_what_was_seen_is_forgotten():
     assert doubt is None
 
 
+def explanation(**changes):
+    """Nothing found, but for the changes."""
+    found = Explanation(
+        time_offset_s=0.0,
+        time_sigma_s=0.001,
+        time_alone_s=0.0,
+        separable=True,
+        zoom=0.0,
+        zoom_sigma=0.001,
+        motion=np.array([0.0, 0.0, 0.2, 12.0, 0.0, 0.0]),
+        needed=np.zeros(3),
+        alone=np.zeros(3),
+        unexplained=0.0,
+        sections=20,
+    )
+    return dataclasses.replace(found, **changes)
+
+
+LATE = {"time_offset_s": 0.025, "needed": np.array([0.0, 400.0, 0.0])}
+ZOOMED = {"zoom": 0.03, "needed": np.array([0.0, 0.0, 400.0])}
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({}, None),
+        (LATE, "time_offset"),
+        (LATE | {"separable": False}, None),
+        (LATE | {"time_offset_s": 0.010}, None),
+        (LATE | {"needed": np.array([0.0, 10.0, 0.0])}, None),
+        (ZOOMED, "intrinsics_changed"),
+        (ZOOMED | {"zoom": 0.01}, None),
+        (ZOOMED | {"needed": np.array([0.0, 0.0, 10.0])}, None),
+    ],
+)
+def test_while_nothing_stirs_only_what_is_sure_and_matters_is_told(changes, code):
+    mount = mount_of()
+    doubt = module.doubt_of(explanation(**changes), mount, CauseParameters(), stirred=False, claimed=False)
+    assert (None if doubt is None else doubt.code) == code
+
+
+@pytest.mark.parametrize(
+    ("alone", "claimed", "code"),
+    [
+        ((0.0, 90.0, 90.0), True, None),
+        ((90.0, 0.0, 90.0), True, "time_offset"),
+        ((90.0, 90.0, 0.0), True, "intrinsics_changed"),
+        ((3.0, 0.0, 90.0), True, "forward_or_sync"),
+        ((3.0, 0.0, 90.0), False, "forward_or_sync"),
+        ((0.0, 90.0, 5.0), True, None),
+        ((90.0, 2.0, 0.0), True, "cause_open"),
+        ((90.0, 2.0, 0.0), False, None),
+        ((90.0, 80.0, 70.0), True, "cause_open"),
+    ],
+)
+def test_what_stirs_is_doubted_where_the_mount_is_not_the_best_cause(alone, claimed, code):
+    mount = mount_of()
+    found = explanation(alone=np.array(alone))
+    doubt = module.doubt_of(found, mount, CauseParameters(), stirred=True, claimed=claimed)
+    assert (None if doubt is None else doubt.code) == code
+    sure = dataclasses.replace(found, needed=np.array([50.0, 0.0, 0.0]))
+    assert module.doubt_of(sure, mount, CauseParameters(), stirred=True, claimed=claimed) is None
+
+
 def test_every_cause_but_the_mount_has_a_reason_and_a_code():
-    assert set(module.REASONS) == set(verdict.CODES) & set(module.REASONS)
+    assert set(module.REASONS) == set(typing.get_args(Cause)) - {"mount"}
     assert all(verdict.CODES[code] == "suspect" for code in module.REASONS)

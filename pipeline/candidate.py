@@ -215,7 +215,9 @@ class Proposer:
         shown = [frame for frame in frames if frame.stamp_ns >= moved_ns]
         if belief is not None and len(shown) == len(frames):
             self.note(belief, shown)
-        if ended or self.due(shown):
+        # Too few frames at the end say nothing against what was proposed before.
+        last = ended and (self.proposal is None or len(shown) >= self._criteria.least_frames)
+        if last or self.due(shown):
             self.propose(shown, lines, now_ns)
 
     def note(self, belief: Belief, frames: Sequence[EdgeFrame]) -> None:
@@ -249,7 +251,7 @@ class Proposer:
             now_ns: Stamp of the data.
         """
         self.proposal = self._proposed(frames, lines, now_ns)
-        if frames:
+        if len(frames) >= self._criteria.least_frames:
             self._tried_ns = frames[-1].stamp_ns
         return self.proposal
 

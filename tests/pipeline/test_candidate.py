@@ -246,6 +246,12 @@ def test_only_frames_that_show_the_moved_mount_take_part():
     assert maker.proposal is None
     maker.follow(frames[2].stamp_ns, None, frames, [], 2, ended=True)
     assert "6 frames" in maker.proposal.reason
+    # Once something was found, silence at the end takes nothing back.
+    maker.follow(0, None, frames, [], 3)
+    found = maker.proposal
+    assert isinstance(found, Candidate)
+    maker.follow(0, None, frames[:2], [], 4, ended=True)
+    assert maker.proposal is found
     memory = dataclasses.replace(verdict.start(0), severity="major", onset=Onset(5, 3, 9))
     assert moved_since(memory) == 9
     assert moved_since(dataclasses.replace(memory, onset=Onset(3, 3, 9))) == 3

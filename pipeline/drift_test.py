@@ -136,7 +136,8 @@ class Judgement:
         statistic: Joint statistic T, chi-square of six degrees of freedom without drift.
         alarming: The window by itself says 'moved'.
         suspicious: More evidence is wanted.
-        blind: Image and cloud show nothing in common.
+        blind: Image and cloud show nothing in common, or nothing that one extrinsic alone explains.
+        ambiguous: The latter: the estimate is far off, and most cells of the image prefer what is expected.
         contradicted: The witnesses contradict each other: nothing is claimed.
     """
 
@@ -151,6 +152,7 @@ class Judgement:
     alarming: bool
     suspicious: bool
     blind: bool
+    ambiguous: bool
     contradicted: bool
 
     def __post_init__(self) -> None:
@@ -233,7 +235,9 @@ def judge(
     statistic = float(evidence.drift @ P_inverse @ evidence.drift)
     bound = expectation.bound + 2.0 * np.abs(evidence.feigned)
     protection = (parameters.K_fa + parameters.K_md) * sigma + bound
-    seen = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
+    in_common = evidence.contrast >= parameters.least_contrast and evidence.peak >= parameters.least_peak
+    ambiguous = statistic > parameters.suspicion and evidence.preference <= 0.0
+    seen = in_common and not ambiguous
     preferred = evidence.preference > parameters.least_preference
     convincing = evidence.loss > parameters.least_loss and preferred and evidence.persistent and seen
     # Without edges there is no score to lose: lines are judged by the joint statistic alone.
@@ -250,5 +254,6 @@ def judge(
         alarming=statistic > parameters.alarm and convincing and not evidence.contradicted,
         suspicious=seen and (statistic > parameters.suspicion or lost),
         blind=not seen,
+        ambiguous=in_common and ambiguous,
         contradicted=evidence.contradicted,
     )

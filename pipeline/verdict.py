@@ -26,6 +26,7 @@ CODES = {
     "too_short": "unobservable",
     "axes_not_monitored": "unobservable",
     "nothing_in_common": "unobservable",
+    "ambiguous": "unobservable",
     "no_scan_pattern": "unobservable",
     "no_pairs": "unobservable",
     "no_input": "stale",
@@ -262,11 +263,8 @@ def _quiet(
     wanted = [AXES.index(axis) for axis in required]
     patient = now_ns - memory.monitored_ns < parameters.patience_ns
     if judgement.blind:
-        reason = (
-            "Image and cloud show nothing in common here (dark, blocked, or off by more than can be seen)."
-        )
         keep = patient and memory.state in ("starting", "healthy")
-        return memory if keep else _enter(memory, "nothing_in_common", reason, now_ns)
+        return memory if keep else _enter(memory, *_blindness(judgement), now_ns)
     monitored = [axis for axis in wanted if judgement.monitored[axis]]
     if len(monitored) < len(wanted) or not wanted:
         reason = _unmonitored_reason(judgement, [a for a in wanted if a not in monitored])
@@ -279,6 +277,14 @@ def _quiet(
         return _enter(memory, "within_stored_uncertainty", reason, now_ns)
     named = ", ".join(AXES[a] for a in range(len(AXES)) if judgement.monitored[a] and judgement.excluded[a])
     return _enter(memory, "within_limits", f"Drift beyond the alert limits is excluded in {named}.", now_ns)
+
+
+def _blindness(judgement: Judgement) -> tuple[str, str]:
+    """Code and reason of a window in which nothing is seen."""
+    if judgement.ambiguous:
+        return "ambiguous", "Several extrinsics explain these scenes about as well: nothing tells them apart."
+    reason = "Image and cloud show nothing in common here (dark, blocked, or off by more than can be seen)."
+    return "nothing_in_common", reason
 
 
 def acknowledge(memory: Memory, now_ns: int, by: str, why: str) -> Memory:
@@ -310,7 +316,7 @@ def finish(memory: Memory, judgement: Judgement | None, frames: int, required: t
         return _enter(memory, "no_scan_pattern", reason, now_ns)
     few = f"{frames} frame{'s are' if frames != 1 else ' is'} too few for a verdict"
     if judgement.blind:
-        return _enter(memory, "nothing_in_common", "Image and cloud show nothing in common.", now_ns)
+        return _enter(memory, *_blindness(judgement), now_ns)
     missing = [AXES.index(axis) for axis in required if not judgement.monitored[AXES.index(axis)]]
     detail = _unmonitored_reason(judgement, missing) if missing else "no judgement was repeated often enough."
     return _enter(memory, "too_short", f"Too short: {few}; {detail}", now_ns)

@@ -62,6 +62,7 @@ def judged():
         alarming=False,
         suspicious=False,
         blind=False,
+        ambiguous=False,
         contradicted=False,
     )
     testimony = fusion.Testimony(DRIFT, np.diag(np.full(6, 100.0)))

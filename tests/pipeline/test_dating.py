@@ -88,7 +88,8 @@ class Pair:
         drift = se3.mount_drift(self.T, T_now, self.mount.R_vehicle_cam)
         sigma = np.array([0.05 * DEG] * 3 + [0.01] * 3)
         yes = np.ones(6, dtype=bool)
-        told = {"alarming": alarming, "suspicious": alarming, "blind": False, "contradicted": False} | marks
+        told = {"alarming": alarming, "suspicious": alarming}
+        told |= {"blind": False, "ambiguous": False, "contradicted": False} | marks
         judgement = Judgement(drift, sigma, sigma, sigma, yes, yes, yes, 50.0, **told)
         evidence = Evidence(drift, np.diag(sigma**2), 0.2, 1.0, 9.0, 4.0, persistent=True, frames=20)
         belief = Belief(judgement, evidence, T_now, None, None, None, None, ())

@@ -47,6 +47,18 @@ def test_thresholds_are_the_quantiles_they_claim():
     assert P.K_md == pytest.approx(stats.norm.isf(1e-3), abs=1e-3)
 
 
+def test_what_most_cells_of_the_image_deny_is_no_drift_but_ambiguous():
+    far = unit(1, math.radians(3.0))
+    denied = judged(far, preference=-0.3)
+    assert denied.ambiguous
+    assert denied.blind
+    assert not denied.alarming
+    assert not denied.suspicious
+    assert not denied.observable.any()
+    assert not judged(far, preference=0.3).ambiguous
+    assert not judged(unit(1, math.radians(0.1)), preference=-0.3).ambiguous
+
+
 def test_a_window_may_alarm_the_more_rarely_the_more_scenes_lie_behind():
     budget = AlarmBudget()
     first, second = (at_chance(P, budget, scene) for scene in (1, 2))

@@ -24,6 +24,7 @@ def judgement(
     alarming=False,
     suspicious=False,
     blind=False,
+    ambiguous=False,
     contradicted=False,
     monitored=AXES,
     excluded=AXES,
@@ -35,7 +36,7 @@ def judgement(
     sigma = np.array([math.radians(0.05)] * 3 + [0.01] * 3)
     marks = [np.array([axis in names for axis in AXES]) for names in (observable, monitored, excluded)]
     return Judgement(
-        drift, sigma, 0.5 * LIMITS, LIMITS, *marks, 0.0, alarming, suspicious, blind, contradicted
+        drift, sigma, 0.5 * LIMITS, LIMITS, *marks, 0.0, alarming, suspicious, blind, ambiguous, contradicted
     )
 
 
@@ -43,10 +44,11 @@ QUIET = judgement()
 SUSPICIOUS = judgement(0.3, suspicious=True)
 ALARM = judgement(0.9, alarming=True, suspicious=True)
 BLIND = judgement(blind=True, monitored=(), observable=())
+AMBIGUOUS = judgement(1.3, blind=True, ambiguous=True, monitored=(), observable=())
 UNMONITORED = judgement(monitored=("pitch", "roll"))
 DOUBTFUL = judgement(0.4, excluded=("pitch",))
 CONTRADICTED = judgement(0.9, suspicious=True, contradicted=True)
-EVERY = (QUIET, SUSPICIOUS, ALARM, BLIND, UNMONITORED, DOUBTFUL, CONTRADICTED)
+EVERY = (QUIET, SUSPICIOUS, ALARM, BLIND, AMBIGUOUS, UNMONITORED, DOUBTFUL, CONTRADICTED)
 
 
 def after(memory, judged, now_ns, window_ns=3 * S, required=REQUIRED):
@@ -151,6 +153,7 @@ def told(memory):
         ((UNMONITORED,) * 10, "axes_not_monitored"),
         ((BLIND,) * 9, "collecting"),
         ((BLIND,) * 10, "nothing_in_common"),
+        ((AMBIGUOUS,) * 10, "ambiguous"),
         ((QUIET, *(UNMONITORED,) * 9), "within_limits"),
         ((QUIET, *(UNMONITORED,) * 10), "axes_not_monitored"),
         ((QUIET, *(BLIND,) * 10), "nothing_in_common"),
@@ -185,6 +188,7 @@ def test_every_code_can_be_told():
         verdict.finish(walked(UNMONITORED), UNMONITORED, 4, REQUIRED),
         walked(*[UNMONITORED] * 10),
         walked(*[BLIND] * 10),
+        walked(*[AMBIGUOUS] * 10),
         verdict.finish(start(0), None, 4, REQUIRED),
         no_pairs,
         verdict.silent(walked(QUIET), 4 * S, P),
@@ -330,6 +334,7 @@ def test_a_drift_outlives_a_fault():
         (None, 0, "no_pairs"),
         (None, 3, "no_scan_pattern"),
         (BLIND, 3, "nothing_in_common"),
+        (AMBIGUOUS, 3, "ambiguous"),
         (UNMONITORED, 3, "too_short"),
         (QUIET, 1, "too_short"),
     ],

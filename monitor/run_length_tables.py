@@ -16,26 +16,24 @@ def run_length_text(found: RunLength) -> str:
 
 
 def _healthy_lines(found: Healthy) -> list[str]:
+    counted = f"{found.hours:.0f} h in {found.drives} drives, {found.scenes} scenes"
+    highest = f"{found.highest:.1f} (whole drives {found.highest_since_start:.1f})"
     lines = [
-        f"Unmoved mounts: {found.hours:.0f} h in {found.drives} drives, {found.scenes} scenes, "
-        f"{found.alarms} false alarms of the sum.",
-        f"Highest statistic {found.highest:.1f} (whole drives {found.highest_since_start:.1f}), "
-        f"level {found.level:.1f}. {found.windows_above} single scenes exceed their level.",
+        f"Unmoved mounts: {counted}, {found.alarms} false alarms of the sum.",
+        f"Highest statistic {highest}, level {found.level:.1f}.",
+        f"{found.windows_above} single scenes exceed their level: the gates of a window are to stop those.",
         "",
         "| lowered level | alarms counted | allowed by the level's run length |",
         "|---|---|---|",
     ]
     lines += [f"| {one.level:g} | {one.counted} | {one.allowed:.1f} |" for one in found.lowered]
     if found.extrapolated_hourly is None:
-        lines += ["", "Hardly a peak is left beyond what one scene may weigh: no tail to extrapolate."]
-    else:
-        middle, low, high = (_YEAR_H * value for value in found.extrapolated_hourly)
-        lines += [
-            "",
-            f"Extrapolated (not counted) from peaks above {found.extrapolated_from:g} to the level: "
-            f"{middle:.2g} false alarms in a vehicle-year of {_YEAR_H:.0f} h, 90 % interval {low:.2g} to {high:.2g}.",
-        ]
-    return lines
+        return [*lines, "", "Hardly a peak is left beyond what one scene may weigh: nothing to extrapolate."]
+    middle, low, high = (_YEAR_H * value for value in found.extrapolated_hourly)
+    rate = f"{middle:.2g} false alarms in a vehicle-year of {_YEAR_H:.0f} h"
+    interval = f"90 % interval {low:.2g} to {high:.2g}"
+    tail = f"Extrapolated, not counted, from peaks above {found.extrapolated_from:g} to the level"
+    return [*lines, "", f"{tail}: {rate}, {interval}."]
 
 
 def _told_lines(told: tuple[Told, ...]) -> list[str]:

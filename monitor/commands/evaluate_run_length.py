@@ -30,8 +30,8 @@ from monitor import commands
 def command(*, hours: float, runs: int, seed: int, as_json: bool, out: Path | None) -> int:
     """Count false alarms and delays of the sum over scenes on simulated evidence of varied roads.
 
-    No images: estimates of scenes are drawn from a model fitted to image-level drives. False alarms at lowered
-    levels are extrapolated to the true one. Exits with 1 if an unmoved mount was called moved.
+    No images: estimates of scenes are drawn from a model fitted to image-level drives. False alarms at
+    lowered levels are extrapolated to the true one. Exits with 1 if an unmoved mount was called moved.
     """
     from monitor.run_length_evaluation import evaluate  # noqa: PLC0415 - numpy is not needed for --help
     from monitor.run_length_tables import run_length_text  # noqa: PLC0415 - likewise

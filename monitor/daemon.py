@@ -180,9 +180,8 @@ def _feed(
     for arrival in arrivals(messages, intake, most, see):
         if stop.is_set():
             return arrival_ns
-        item = arrival.item
         intake.show(arrival.accounts)
-        arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
+        arrival_ns = arrival.arrival_ns
         for pair in arrival.pairs:
             pairs += 1
             found = None if ahead is None else ahead[1].take(pair)

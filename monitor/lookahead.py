@@ -26,13 +26,13 @@ class Arrival:
     """Something that came, and what the intake made of it.
 
     Attributes:
-        item: A message, or a period without any.
+        arrival_ns: When, on the clock of the source, ns.
         pairs: What it completed.
         accounts: Of every pair, up to it.
         notes: How many notes the intake had then.
     """
 
-    item: Message | Tick
+    arrival_ns: int
     pairs: tuple[FramePair, ...]
     accounts: Accounts
     notes: int
@@ -66,7 +66,8 @@ def arrivals(
         found = tuple(intake.take(item)) if isinstance(item, Message) else ()
         for pair in found:
             see(pair)
-        waiting.append(Arrival(item, found, intake.accounts(), len(intake.notes)))
+        arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
+        waiting.append(Arrival(arrival_ns, found, intake.accounts(), len(intake.notes)))
         pairs += len(found)
         while waiting and pairs >= most:
             arrival = waiting.popleft()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from monitor.daemon import watch, watching
-from monitor.events import EndEvent, FrameEvent, StatusEvent
+from monitor.events import EndEvent, FrameEvent, ProposalEvent, StatusEvent
 from monitor.intake import Intake
 from monitor.lookahead import arrivals
 from monitor.messages import Message
@@ -84,6 +84,8 @@ def plain(event):
     if isinstance(event, FrameEvent):
         estimated = None if event.T_estimated is None else event.T_estimated.tolist()
         return event.stamp_ns, event.points.tobytes(), event.edge_points.tobytes(), estimated
+    if isinstance(event, ProposalEvent):
+        return event.pair, None if event.document is None else event.document.model_dump(), event.reason
     assert isinstance(event, EndEvent)
     return event
 
@@ -163,14 +165,15 @@ def test_arrivals_keep_their_order_and_their_accounts(rig, messages):
     stream = [*items(drives.first_frames(messages, 9)), Tick(5)]
     live, shown = Intake(rig), []
     plainly = [
-        (item.item, item.pairs, item.accounts, item.notes) for item in arrivals(stream, live, 0, shown.append)
+        (one.arrival_ns, one.pairs, one.accounts, one.notes)
+        for one in arrivals(stream, live, 0, shown.append)
     ]
-    assert [item for item, *_ in plainly] == stream
+    assert [arrival_ns for arrival_ns, *_ in plainly] == [*(message.log_ns for message in stream[:-1]), 5]
     seen, ahead, most = [], [], 0
     for arrival in arrivals(stream, Intake(rig), 4, seen.append):
         ahead.append(arrival)
         most = max(most, len(seen) - sum(len(one.pairs) for one in ahead[:-1]))
-    assert [one.item for one in ahead] == stream
+    assert [one.arrival_ns for one in ahead] == [arrival_ns for arrival_ns, *_ in plainly]
     assert [one.accounts for one in ahead] == [accounts for _, _, accounts, _ in plainly]
     assert most == 4
     for one, (_, pairs, _, _) in zip(ahead, plainly, strict=True):

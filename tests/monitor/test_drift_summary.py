@@ -100,7 +100,7 @@ def test_errors_fall_into_the_cells_of_the_stanford_diagram():
         # axis: (answer, truth, protection level, cell)
         0: (0.3, 0.0, 0.4, "nominal"),
         1: (0.0, 0.9, 0.8, "unavailable"),
-        2: (0.7, 0.0, 0.4, "misleading"),
+        2: (1.2, 0.0, 0.7, "misleading"),
         3: (0.3, 0.0, 0.08, "hazardous"),
         4: (0.1, 0.0, 0.08, "nominal"),
     }
@@ -113,8 +113,8 @@ def test_errors_fall_into_the_cells_of_the_stanford_diagram():
     assert (found.misleading, found.hazardous) == (2, 1)
     points = {point.axis: point for point in stanford_points(one)}
     assert "up" not in points  # not observable
-    assert points["yaw"].error == pytest.approx(0.5)
-    assert points["yaw"].sigmas == pytest.approx(0.7 / np.hypot(0.1, 0.2))
+    assert points["yaw"].error == pytest.approx(1.0)
+    assert points["yaw"].sigmas == pytest.approx(1.2 / np.hypot(0.1, 0.2))
     assert points["left"].sigmas == pytest.approx(0.1 / np.hypot(0.01, 0.05))
     assert found.within_one == pytest.approx(0.0)
     assert found.within_two == pytest.approx(2 / 5)

@@ -139,7 +139,8 @@ class Explanation:
 
     def cause(self, parameters: CauseParameters) -> Cause:
         """What is to be named for evidence that a sound mount, clock and lens do not explain."""
-        if self.needed[0] > parameters.mount:
+        # Where the sections show too little to choose by, they have nothing to say against the mount.
+        if self.needed[0] > parameters.mount or self.unexplained <= parameters.rival:
             return "mount"
         most = (parameters.mount_alone, parameters.single_alone, parameters.single_alone)
         best = int(np.argmin(self.alone))

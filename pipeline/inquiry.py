@@ -14,7 +14,7 @@ from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import CameraModel, Floats
 from pipeline.sections import Move, Passage, Place, fresh, linearised
-from pipeline.verdict import Doubt, Memory
+from pipeline.verdict import Doubt, Memory, Steady
 
 _SECTIONS = 90
 """Sections kept: two kilometres, some minutes; a cause that is older than they are stands in all of them."""
@@ -55,7 +55,7 @@ class Inquiry:
         self._window = self._asked_ns = self.explanation = None
 
     def ask(
-        self, frames: Sequence[EdgeFrame], belief: Belief, memory: Memory, *, stirred: bool, claimed: bool
+        self, frames: Sequence[EdgeFrame], belief: Belief, memory: Memory, steady: Steady | None
     ) -> Doubt | None:
         """What speaks against a moved mount after a judgement.
 
@@ -63,26 +63,37 @@ class Inquiry:
             frames: The window's frames with edges, ascending in time.
             belief: What was judged.
             memory: Before the judgement.
-            stirred: Whether there is suspicion.
-            claimed: Whether the evidence is to be called a drift.
+            steady: What all scenes of the drive together say, or None.
 
         Returns:
             Another cause, or that it is open; None where the mount may be blamed, or nothing is wrong.
         """
+        judgement = belief.judgement
+        sudden = judgement.alarming or judgement.suspicious
+        slow = steady is not None and (steady.alarming or steady.suspicious)
+        claimed = judgement.alarming or (steady is not None and steady.alarming)
         moves = {move.stamp_ns: move for move in self._moves}
         window = [Passage(frame, moves[frame.stamp_ns]) for frame in frames if frame.stamp_ns in moves]
-        if belief.edges is None or belief.judgement.blind or not window:
+        if belief.edges is None or judgement.blind or not window:
             return None
         self._close(window, belief.edges.xi)
-        if stirred and memory.severity is None:
+        if sudden and memory.severity is None:
             self._look_closer(window, belief.edges.xi)
         else:
             self._window = self._asked_ns = None
-        self._explain(memory, stirred=stirred or memory.severity is not None)
+        expectation = self._mount.expectation(self._parameters.test)
+        if sudden or memory.severity is not None:
+            # Before the last quiet judgement nothing was wrong: what was seen then is of another mount.
+            self._explain(expectation.covariance + expectation.floor, memory.quiet_ns)
+        elif slow and steady is not None:
+            # What all scenes tell is a change on the way, of which the stored extrinsic's own doubt is no part.
+            self._explain(expectation.floor, steady.onset.from_ns)
+        else:
+            self._explain(expectation.covariance + expectation.floor, None)
         if self.explanation is None:
             return None
         settings = self._parameters.causes
-        return doubt_of(self.explanation, self._mount, settings, stirred=stirred, claimed=claimed)
+        return doubt_of(self.explanation, self._mount, settings, stirred=sudden or slow, claimed=claimed)
 
     def _close(self, window: Sequence[Passage], xi: Floats) -> None:
         """Keeps the newest frames as a section of their own once they make one."""
@@ -100,22 +111,17 @@ class Inquiry:
         self._asked_ns = now_ns
         self._window = linearised(window, xi, self._place(), self._parameters.edge_witness)
 
-    def _explain(self, memory: Memory, *, stirred: bool) -> None:
-        sections = list(self._sections)
-        if stirred:
-            # Before the last quiet judgement nothing was wrong: what was seen then is of another mount.
-            since_ns = memory.quiet_ns
-            until_ns = self._window.from_ns if self._window is not None else None
-            sections = [
-                s for s in sections if s.from_ns > since_ns and (until_ns is None or s.to_ns < until_ns)
-            ]
-            sections += [] if self._window is None else [self._window]
-        if not sections:
-            self.explanation = None
-            return
-        expectation = self._mount.expectation(self._parameters.test)
-        doubt = expectation.covariance + expectation.floor
-        self.explanation = explain(sections, doubt, self._mount.limits, self._parameters.causes)
+    def _explain(self, covariance: Floats, since_ns: int | None) -> None:
+        """Asks the sections after ``since_ns``, and the window in place of those that it holds."""
+        window = () if self._window is None else (self._window,)
+        sections = [
+            s
+            for s in self._sections
+            if (since_ns is None or s.from_ns > since_ns) and all(s.to_ns < w.from_ns for w in window)
+        ]
+        sections += window
+        limits, settings = self._mount.limits, self._parameters.causes
+        self.explanation = explain(sections, covariance, limits, settings) if sections else None
 
     def _place(self) -> Place:
         mount, expectation = self._mount, self._mount.expectation(self._parameters.test)

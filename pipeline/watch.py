@@ -268,7 +268,7 @@ class Watch:
         self._sum_scene(self.belief, now_ns)
         steady = self._steady()
         with stage("inquiry"):
-            doubt = self._doubt(self.belief, self.memory, steady)
+            doubt = self.inquiry.ask(tuple(self._edge_frames), self.belief, self.memory, steady)
         self.memory = verdict.advance(
             self.memory,
             self.belief.judgement,
@@ -318,15 +318,6 @@ class Watch:
             scenes=total.scenes,
             onset=Onset(since_ns, before_ns, since_ns),
         )
-
-    def _doubt(
-        self, belief: Belief, memory: verdict.Memory, steady: verdict.Steady | None
-    ) -> verdict.Doubt | None:
-        """What else than the mount may have changed."""
-        judgement = belief.judgement
-        claimed = judgement.alarming or (steady is not None and steady.alarming)
-        stirred = claimed or judgement.suspicious or (steady is not None and steady.suspicious)
-        return self.inquiry.ask(tuple(self._edge_frames), belief, memory, stirred=stirred, claimed=claimed)
 
     def _propose(self, now_ns: int, *, ended: bool = False) -> None:
         """Looks for the extrinsic that holds now, where the stored one does not."""

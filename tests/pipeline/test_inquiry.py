@@ -158,8 +158,7 @@ def test_what_was_seen_is_forgotten():
     assert watch.inquiry.explanation is not None
     watch.inquiry.forget()
     assert watch.inquiry.explanation is None
-    doubt = watch.inquiry.ask((), watch.belief, watch.memory, stirred=True, claimed=True)
-    assert doubt is None
+    assert watch.inquiry.ask((), watch.belief, watch.memory, None) is None
 
 
 def explanation(**changes):
@@ -174,7 +173,7 @@ def explanation(**changes):
         motion=np.array([0.0, 0.0, 0.2, 12.0, 0.0, 0.0]),
         needed=np.zeros(3),
         alone=np.zeros(3),
-        unexplained=0.0,
+        unexplained=100.0,
         sections=20,
     )
     return dataclasses.replace(found, **changes)
@@ -222,8 +221,9 @@ def test_what_stirs_is_doubted_where_the_mount_is_not_the_best_cause(alone, clai
     found = explanation(alone=np.array(alone))
     doubt = module.doubt_of(found, mount, CauseParameters(), stirred=True, claimed=claimed)
     assert (None if doubt is None else doubt.code) == code
-    sure = dataclasses.replace(found, needed=np.array([50.0, 0.0, 0.0]))
-    assert module.doubt_of(sure, mount, CauseParameters(), stirred=True, claimed=claimed) is None
+    for silent in ({"needed": np.array([50.0, 0.0, 0.0])}, {"unexplained": 5.0}):
+        sure = dataclasses.replace(found, **silent)
+        assert module.doubt_of(sure, mount, CauseParameters(), stirred=True, claimed=claimed) is None
 
 
 def test_every_cause_but_the_mount_has_a_reason_and_a_code():

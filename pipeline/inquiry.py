@@ -86,7 +86,7 @@ class Inquiry:
             # Before the last quiet judgement nothing was wrong: what was seen then is of another mount.
             self._explain(expectation.covariance + expectation.floor, memory.quiet_ns)
         elif slow and steady is not None:
-            # What all scenes tell is a change on the way, of which the stored extrinsic's own doubt is no part.
+            # All scenes tell of a change on the way: the stored extrinsic's own doubt is no part of it.
             self._explain(expectation.floor, steady.onset.from_ns)
         else:
             self._explain(expectation.covariance + expectation.floor, None)

@@ -5,14 +5,19 @@ from collections.abc import Callable
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
+from scipy.stats import chi2
 
+from monitor.scene_evidence import SIGMA_M, SIGMA_RAD, image_level
+from monitor.statements import TO_PEOPLE
 from pipeline import drift_test
 from pipeline.drift_test import DriftTestParameters, Expectation
 from pipeline.records import AXES, Floats
 from pipeline.run_length import AlarmBudget, alarm_level, chance_per_scene
+from pipeline.scene_filter import Scene
 from pipeline.scene_sum import SceneSumParameters
 from pipeline.scene_track import TrackParameters
 from pipeline.simulation.evidence import EvidenceModel
+from pipeline.simulation.evidence_fit import fit
 from pipeline.simulation.long_drives import (
     HealthyDrive,
     World,
@@ -49,9 +54,7 @@ _KINDS = 2 * (len(AXES) * len(SIZES[0]) + 1)
 
 _LEVELS = (16.0, 20.0, 24.0, 28.0, 32.0, 36.0)
 _PEAKS = 20
-
-_SIGMA_RAD, _SIGMA_M = math.radians(0.1), 0.02
-"""Of a stored extrinsic that says nothing else (DESIGN 3)."""
+_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.97)
 
 
 class _Values(BaseModel):
@@ -116,10 +119,30 @@ class Tracked(_Values):
     """Share of errors within two stated sigmas."""
 
 
+class Fitted(_Values):
+    """Image-level streets; each triple is a value and its 90 % interval (``evidence_fit``)."""
+
+    streets: int
+    ridden: int
+    ridden_ratio: float
+    scenes: int
+    ratio: tuple[float, float, float]
+    share: tuple[float, float, float]
+    common: tuple[float, float, float]
+    common_m: tuple[float, float, float]
+    freedom: float
+    worth_spread: float
+    sigma: tuple[float, ...]
+    """Stated for a scene of middling worth, deg and m."""
+    quantiles: tuple[tuple[float, float, float], ...]
+    """Level, squared errors at it in sigmas of the fitted model, and chi-square's."""
+
+
 class RunLength(_Values):
     """Everything."""
 
     seed: int
+    fitted: Fitted | None
     healthy: Healthy
     told: tuple[Told, ...]
     tracked: tuple[Tracked, ...]
@@ -128,7 +151,7 @@ class RunLength(_Values):
 def worlds() -> dict[str, World]:
     """What is simulated: a stored extrinsic on streets like real ones, a baseline on simulated ones."""
     test = DriftTestParameters()
-    stored = drift_test.expectation_of_stored(_SIGMA_RAD, _SIGMA_M, test)
+    stored = drift_test.expectation_of_stored(SIGMA_RAD, SIGMA_M, test)
     street = STREET_SHARE**2 * stored.floor
     learned = Expectation(np.zeros(6), street / _BASELINE_STREETS, street, stored.bound)
     return {
@@ -137,24 +160,28 @@ def worlds() -> dict[str, World]:
     }
 
 
-def evaluate(hours: float, runs: int, seed: int, progress: Callable[[str, int, int], None]) -> RunLength:
+def evaluate(
+    hours: float, runs: int, streets: int, seed: int, progress: Callable[[str, int, int], None]
+) -> RunLength:
     """Healthy hours, delays of drifts, a mount followed.
 
     Args:
         hours: Of healthy driving.
         runs: Drives for each drift.
+        streets: Image-level streets to fit the evidence model to, for comparison; 0: none.
         seed: Of everything.
         progress: Told what is done: name, done, of how many.
     """
     parameters = SceneSumParameters()
     known = worlds()
+    fitted = fitted_to(image_level(streets, seed, progress)) if streets else None
     drives = []
     count = max(1, round(hours * 3600.0 / DRIVE_S))
     for index in range(count):
         progress("healthy drive", index + 1, count)
         drives.append(healthy(known["stored"], DRIVE_S, parameters, np.random.default_rng([seed, 0, index])))
     summary = summarised(drives, parameters.budget, np.random.default_rng([seed, 1]))
-    told = []
+    told: list[Told] = []
     for number, (name, world) in enumerate(known.items()):
         for axis, axis_name in enumerate(AXES):
             for size in SIZES[axis // 3]:
@@ -162,7 +189,30 @@ def evaluate(hours: float, runs: int, seed: int, progress: Callable[[str, int, i
                 told.append(_told(name, world, axis, size, runs, [seed, 2, number]))
         told.append(_told(name, world, 2, RAMP_DEG_PER_MINUTE, runs, [seed, 3, number], ramp=True))
     followed = [_tracked(name, world, [seed, 4, n]) for n, (name, world) in enumerate(known.items())]
-    return RunLength(seed=seed, healthy=summary, told=tuple(told), tracked=tuple(followed))
+    return RunLength(seed=seed, fitted=fitted, healthy=summary, told=tuple(told), tracked=tuple(followed))
+
+
+def fitted_to(streets: list[list[Scene]]) -> Fitted:
+    """The evidence model as image-level streets have it."""
+    found = fit(streets, DriftTestParameters().floor())
+    sigma = np.sqrt(np.diag(found.covariance)) * TO_PEOPLE
+    return Fitted(
+        streets=found.streets,
+        ridden=found.ridden,
+        ridden_ratio=found.ridden_ratio,
+        scenes=found.scenes,
+        ratio=found.ratio,
+        share=found.share,
+        common=found.common,
+        common_m=found.correlation_m,
+        freedom=found.freedom,
+        worth_spread=found.worth_spread,
+        sigma=tuple(sigma.tolist()),
+        quantiles=tuple(
+            (level, float(np.quantile(found.squares, level)), float(chi2.ppf(level, len(AXES))))
+            for level in _QUANTILES
+        ),
+    )
 
 
 def summarised(drives: list[HealthyDrive], budget: AlarmBudget, rng: np.random.Generator) -> Healthy:
@@ -224,11 +274,10 @@ def _told(
 def _tracked(name: str, world: World, seed: list[int]) -> Tracked:
     errors, sigmas = tracked(world, TrackParameters(), _TRACKED_S, np.random.default_rng(seed))
     errors, sigmas = errors[_SETTLED:], sigmas[_SETTLED:]
-    people = np.array([180.0 / math.pi] * 3 + [1.0] * 3)
     return Tracked(
         world=name,
         hours=_TRACKED_S / 3600.0,
-        rms=tuple((np.sqrt(np.mean(errors**2, axis=0)) * people).tolist()),
-        sigma=tuple((sigmas.mean(axis=0) * people).tolist()),
+        rms=tuple((np.sqrt(np.mean(errors**2, axis=0)) * TO_PEOPLE).tolist()),
+        sigma=tuple((sigmas.mean(axis=0) * TO_PEOPLE).tolist()),
         within_two=float(np.mean(np.abs(errors) <= 2.0 * sigmas)),
     )

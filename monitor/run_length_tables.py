@@ -1,6 +1,6 @@
 """Run length and delays as Markdown, for people."""
 
-from monitor.run_length_evaluation import Healthy, RunLength, Told, Tracked
+from monitor.run_length_evaluation import Fitted, Healthy, RunLength, Told, Tracked
 from pipeline.records import AXES
 
 _YEAR_H = 2920.0
@@ -12,7 +12,36 @@ _ANGLES = 3
 def run_length_text(found: RunLength) -> str:
     """All tables."""
     lines = [*_healthy_lines(found.healthy), "", *_told_lines(found.told), "", *_tracked_lines(found.tracked)]
+    if found.fitted is not None:
+        lines = [*_fitted_lines(found.fitted), "", *lines]
     return "\n".join([*lines, "", f"Seed {found.seed}."])
+
+
+def _fitted_lines(found: Fitted) -> list[str]:
+    sigma = " ".join(f"{value:.3f}" for value in found.sigma)
+    ridden = f"of which {found.ridden} lie in false modes (ratio {found.ridden_ratio:.1f})"
+    lines = [
+        f"Image-level streets: {found.streets}, {ridden}; {found.scenes} scenes of the others.",
+        "",
+        "| quantity | fitted | 90 % interval |",
+        "|---|---|---|",
+    ]
+    for name, (middle, low, high) in (
+        ("random error over the stated one (ratio)", found.ratio),
+        ("difference of streets over the floor (share)", found.share),
+        ("random error common to neighbours (common)", found.common),
+        ("over so many m (common_m)", found.common_m),
+    ):
+        lines.append(f"| {name} | {middle:.2f} | {low:.2f} to {high:.2f} |")
+    lines += [
+        f"| degrees of freedom of the tails | {found.freedom:g} | |",
+        f"| spread of the logarithm of stated sigmas | {found.worth_spread:.2f} | |",
+        f"| middling stated sigmas, deg and m | {sigma} | |",
+        "",
+        "| quantile | squared error in fitted sigmas | chi-square, 6 |",
+        "|---|---|---|",
+    ]
+    return lines + [f"| {level:g} | {square:.1f} | {chi:.1f} |" for level, square, chi in found.quantiles]
 
 
 def _healthy_lines(found: Healthy) -> list[str]:

@@ -26,8 +26,15 @@ from monitor import commands
     show_default=True,
     help="Drives for each drift.",
 )
+@click.option(
+    "--streets",
+    type=click.IntRange(0, 10_000),
+    default=0,
+    show_default=True,
+    help="Image-level streets, half a minute each, to hold the evidence model against.",
+)
 @commands.output_options
-def command(*, hours: float, runs: int, seed: int, as_json: bool, out: Path | None) -> int:
+def command(*, hours: float, runs: int, streets: int, seed: int, as_json: bool, out: Path | None) -> int:
     """Count false alarms and delays of the sum over scenes on simulated evidence of varied roads.
 
     No images: estimates of scenes are drawn from a model fitted to image-level drives. False alarms at
@@ -37,7 +44,7 @@ def command(*, hours: float, runs: int, seed: int, as_json: bool, out: Path | No
     from monitor.run_length_tables import run_length_text  # noqa: PLC0415 - likewise
 
     folder = commands.made(out)
-    found = evaluate(hours, runs, seed, commands.progress)
+    found = evaluate(hours, runs, streets, seed, commands.progress)
     commands.clear()
     commands.deliver(
         folder, "run-length", run_length_text(found), found.model_dump_json(indent=1), None, as_json=as_json

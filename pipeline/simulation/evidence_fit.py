@@ -21,11 +21,6 @@ _BOUNDS = ((0.05, 5.0), (1e-3, 5.0), (1e-3, 0.99), (5.0, 2000.0))
 _STEP = 0.2
 """First step of the search for the ends of an interval, in the logarithm; each is half as long again."""
 
-_SEARCH = {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
-
-_ROUGH = {"maxiter": 150, "xatol": 0.02, "fatol": 0.02}
-"""Of the other parameters while one is held: hundredths of 2.71 are enough."""
-
 _START = (0.8, 0.3, 0.3, 60.0)
 """Where the likeliest are sought from."""
 
@@ -101,7 +96,13 @@ def fit(drives: Sequence[Sequence[Scene]], floor: Floats) -> EvidenceFit:
         return sum(block.surprise(*np.exp(x)) for block in blocks)
 
     bounds = np.log(_BOUNDS)
-    best = minimize(cost, np.log(_START), method="Nelder-Mead", bounds=_bounds(), options=_SEARCH)
+    best = minimize(
+        cost,
+        np.log(_START),
+        method="Nelder-Mead",
+        bounds=_bounds(),
+        options={"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3},
+    )
     middle = [float(value) for value in np.exp(best.x)]
     found = [(value, *_interval(cost, best.x, best.fun, index, bounds)) for index, value in enumerate(middle)]
     ratio, share, common, correlation_m = found
@@ -183,10 +184,10 @@ def _interval(
             def held(x: Floats) -> float:
                 return cost(np.insert(x, index, at))
 
-            return float(
-                minimize(held, best[others], method="Nelder-Mead", bounds=_bounds(others), options=_ROUGH).fun
-                - least
-            )
+            # Of the other parameters, hundredths of 2.71 are enough.
+            rough = {"maxiter": 150, "xatol": 0.02, "fatol": 0.02}
+            found = minimize(held, best[others], method="Nelder-Mead", bounds=_bounds(others), options=rough)
+            return float(found.fun) - least
 
         while bounds[index][0] < value < bounds[index][1] and surplus(value) < chi2.isf(0.1, 1):
             value, step = value + sign * step, 1.5 * step

@@ -8,9 +8,10 @@ import pytest
 from click.testing import CliRunner
 
 from monitor.commands.evaluate_run_length import command
-from monitor.run_length_evaluation import RunLength, Told, Tracked, summarised
+from monitor.run_length_evaluation import RunLength, Told, Tracked, fitted_to, summarised
 from monitor.run_length_tables import run_length_text
 from pipeline.run_length import AlarmBudget
+from pipeline.simulation.evidence import EvidenceModel, scenes
 from pipeline.simulation.long_drives import HealthyDrive
 
 
@@ -27,8 +28,12 @@ def test_tables_say_what_was_counted_what_was_extrapolated_and_what_was_not_told
         world="stored", axis="yaw", size=0.1, ramp=False, runs=2, told=0, early=0, seconds=None, way_m=None
     )
     tracked = Tracked(world="stored", hours=1.0, rms=(0.02,) * 6, sigma=(0.03,) * 6, within_two=0.95)
-    text = run_length_text(RunLength(seed=1, healthy=healthy, told=(told,), tracked=(tracked,)))
+    fitted = fitted_to([list(scenes(EvidenceModel(), 12.0, lambda _: np.zeros(6), rng)) for _ in range(8)])
+    text = run_length_text(
+        RunLength(seed=1, fitted=fitted, healthy=healthy, told=(told,), tracked=(tracked,))
+    )
     assert "10 h in 1 drives, 20000 scenes, 0 false alarms" in text
+    assert "Image-level streets: 8" in text
     assert "Extrapolated, not counted" in text
     assert "| stored | yaw 0.1 deg | 0 of 2 | 0 |  |  |" in text
     assert "0.020 (0.030) deg" in text

@@ -71,4 +71,6 @@ def test_the_page_has_a_place_for_what_the_make_target_measures():
     recipe = (ROOT / "Makefile").read_text().partition("\nfigures-drift:")[2].partition("\n\n")[0]
     page = (ROOT / "docs" / "drift.md").read_text()
     places = [part.partition(" -->")[0] for part in page.split("<!-- ")[1:]]
-    assert set(places) - {"end"} == {part.split()[0].rstrip(")") for part in recipe.split("$(OUT)/drift/")[1:]}
+    assert set(places) - {"end"} == {
+        part.split()[0].rstrip(")") for part in recipe.split("$(OUT)/drift/")[1:]
+    }

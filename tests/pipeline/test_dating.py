@@ -95,7 +95,7 @@ class Pair:
         belief = Belief(judgement, evidence, T_now, None, None, None, None, ())
         self.memory = dataclasses.replace(self.memory, input_ns=now_ns, severity=severity)
         before = self.memory
-        self.memory = self.dating.dated(before, self.mount, EXPECTED, belief, now_ns - S)
+        self.memory = self.dating.dated(before, self.mount, EXPECTED, belief, now_ns - S // 2)
         self.belief = belief
         return self.memory.onset
 
@@ -178,8 +178,9 @@ def test_windows_date_what_is_older_than_the_frames(seen):
         pair.judge(second * S, 0.0 if second < 40 else 1.0, alarming=second >= 40)
     pair.see(driven(seen, np.ones(12), begin_ns=100 * S))
     told = pair.tell(101 * S + STEP)
-    # A window shows nothing younger than a second here, and at such an age one in ten is kept.
+    # A window shows nothing younger than half a second here, and at such an age one in ten is kept.
     assert told.from_ns <= 40 * S <= told.to_ns
+    assert told.from_ns % S == S // 2
     assert told.from_ns >= 25 * S
     assert told.to_ns <= 50 * S
 

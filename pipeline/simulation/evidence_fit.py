@@ -185,8 +185,13 @@ def _interval(
                 return cost(np.insert(x, index, at))
 
             # Of the other parameters, hundredths of 2.71 are enough.
-            rough = {"maxiter": 150, "xatol": 0.02, "fatol": 0.02}
-            found = minimize(held, best[others], method="Nelder-Mead", bounds=_bounds(others), options=rough)
+            found = minimize(
+                held,
+                best[others],
+                method="Nelder-Mead",
+                bounds=_bounds(others),
+                options={"maxiter": 150, "xatol": 0.02, "fatol": 0.02},
+            )
             return float(found.fun) - least
 
         while bounds[index][0] < value < bounds[index][1] and surplus(value) < chi2.isf(0.1, 1):

@@ -19,18 +19,19 @@ from pipeline.baseline import Baseline
 from pipeline.errors import InputError, RigError
 from pipeline.mount import Mount
 from pipeline.records import Floats
-from pipeline.road_samples import RoadSample, Scatter
+from pipeline.road_samples import Scatter, Street
 from pipeline.run_tail import Tail
 
 SCHEMA: Literal["calibwatch.baseline/1"] = "calibwatch.baseline/1"
 
 _LARGEST_FILE = 64 << 20
-"""bytes; a stretch takes 1.2 kB, so this is ten thousand kilometres of road."""
+"""bytes; a stretch takes 0.4 kB, so this is thirty thousand kilometres of road."""
 
 _AXES_ALIKE = 1e-6
 """Largest difference of two rotations that passes as rounding of a file."""
 
 _Six: TypeAlias = Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
+_Sigma: TypeAlias = Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=6, max_length=6)]
 _Matrix: TypeAlias = Annotated[list[_Six], Field(min_length=6, max_length=6)]
 _Row3: TypeAlias = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _NonNegative: TypeAlias = Annotated[FiniteFloat, Field(ge=0)]
@@ -46,9 +47,8 @@ class StretchPart(_Part):
 
     recording: str = Field(max_length=4096)
     mean: _Six = Field(description="mean estimate: roll pitch yaw rad, forward left up m")
-    covariance: _Matrix = Field(description="of its random error")
-    windows: PositiveInt
-    samples: _Positive = Field(description="independent windows that they are worth")
+    windows: PositiveInt = Field(description="windows that share no frame")
+    samples: _Positive = Field(description="independent windows that all its windows are worth")
     way_m: _NonNegative
     seconds: _NonNegative
 
@@ -71,8 +71,8 @@ class PairPart(_Part):
     bias: _Six
     covariance: _Matrix = Field(description="of the bias")
     spread: _Matrix = Field(description="of what the scene adds")
-    departure: Annotated[list[_NonNegative], Field(min_length=6, max_length=6)]
-    deviation: Annotated[list[_NonNegative], Field(min_length=6, max_length=6)]
+    deviation: _Sigma = Field(description="root mean square of the windows from the bias")
+    own: _Sigma = Field(description="root mean square of the windows' own sigma")
     noise: _Positive = Field(description="factor on the stated sigma of a window")
     correlation_m: _Positive
     stretches: list[StretchPart] = Field(min_length=1)
@@ -104,21 +104,20 @@ def _part(mount: Mount, baseline: Baseline) -> PairPart:
         bias=baseline.bias.tolist(),
         covariance=baseline.covariance.tolist(),
         spread=baseline.spread.tolist(),
-        departure=baseline.departure.tolist(),
         deviation=baseline.deviation.tolist(),
+        own=baseline.own.tolist(),
         noise=baseline.scatter.noise,
         correlation_m=baseline.scatter.correlation_m,
         stretches=[
             StretchPart(
-                recording=sample.recording,
-                mean=sample.mean.tolist(),
-                covariance=sample.covariance.tolist(),
-                windows=sample.windows,
-                samples=sample.samples,
-                way_m=sample.way_m,
-                seconds=sample.seconds,
+                recording=street.recording,
+                mean=street.mean.tolist(),
+                windows=street.windows,
+                samples=street.samples,
+                way_m=street.way_m,
+                seconds=street.seconds,
             )
-            for sample in baseline.stretches
+            for street in baseline.stretches
         ],
         tail=TailPart(**dataclasses.asdict(baseline.tail)),
     )
@@ -212,20 +211,19 @@ def _baseline(part: PairPart, where: str) -> Baseline:
         bias=np.array(part.bias),
         covariance=_covariance(part.covariance, f"{where}.covariance"),
         spread=_covariance(part.spread, f"{where}.spread"),
-        departure=np.array(part.departure),
         deviation=np.array(part.deviation),
+        own=np.array(part.own),
         scatter=Scatter(noise=part.noise, correlation_m=part.correlation_m),
         stretches=tuple(
-            RoadSample(
+            Street(
                 recording=stretch.recording,
                 mean=np.array(stretch.mean),
-                covariance=_covariance(stretch.covariance, f"{where}.stretches.{index}.covariance"),
                 windows=stretch.windows,
                 samples=stretch.samples,
                 way_m=stretch.way_m,
                 seconds=stretch.seconds,
             )
-            for index, stretch in enumerate(part.stretches)
+            for stretch in part.stretches
         ),
         tail=Tail(**part.tail.model_dump()),
     )

@@ -22,7 +22,7 @@ from pipeline.errors import InputError, RigError
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats
-from pipeline.road_samples import Scatter, largest_change, sample_of
+from pipeline.road_samples import largest_change, mean_of
 from pipeline.segmentation import Segmenter
 
 WANTED_S = 365 * 8 * 3600.0
@@ -167,7 +167,7 @@ def learned_from(mount: Mount, drives: Sequence[Drive], pair: str) -> Learned:
     _refuse_twins(usable, pair)
     rng = np.random.default_rng(parameters.seed)
     baseline = learn([drive.estimates for drive in usable], parameters.test, WANTED_S, rng)
-    others = left_out(baseline.stretches, parameters.test)
+    others = left_out([drive.estimates for drive in usable], parameters.test)
     _refuse_stranger(others, parameters.test.alarm, pair)
     return Learned(mount, baseline, others, unused)
 
@@ -181,11 +181,10 @@ def _refuse_unhealthy(mount: Mount, drives: Sequence[Drive], pair: str, test: Dr
     troubles = []
     for drive in drives:
         name = drive.estimates.recording
-        sample = sample_of(drive.estimates, Scatter(noise=1.0, correlation_m=np.inf))
-        sigma = np.sqrt(np.diag(sample.covariance))
-        beyond = np.abs(sample.mean) - _SURE_SIGMAS * sigma > mount.limits
+        mean, covariance = mean_of(drive.estimates)
+        beyond = np.abs(mean) - _SURE_SIGMAS * np.sqrt(np.diag(covariance)) > mount.limits
         if beyond.any():
-            troubles.append(f"{name} is off by {_sizes(sample.mean, np.flatnonzero(beyond))}")
+            troubles.append(f"{name} is off by {_sizes(mean, np.flatnonzero(beyond))}")
             continue
         change = largest_change(drive.estimates, test.floor())
         if change.statistic > test.alarm:

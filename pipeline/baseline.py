@@ -1,14 +1,15 @@
 """A rig's own bias, learned on healthy drives, and how far scenes pull it (FORMULAS F2, F5; PROBE 3).
 
-Stretches of road are the samples, windows of one street are not. A stretch ``s`` shows
-``y_s = bias + scene_s + random_s``, ``scene_s ~ N(0, spread)``, ``random_s`` with its stated covariance. Bias
-and spread are those of the largest restricted posterior, the spread drawn towards the floor that holds for
-any rig; what is handed to the test is narrower than that floor only where the stretches prove it.
+Stretches of road are the samples, windows of one street are not. Windows that share no frame show
+``y_k = bias + scene_k + random_k``, ``scene_k ~ N(0, spread)``, ``random_k`` with its stated covariance; how
+alike the scenes of one stretch are is not known, so together they weigh as one. Bias and spread are those of
+the largest restricted posterior, the spread drawn towards the floor that holds for any rig; what is handed to
+the test is narrower than that floor only where the stretches prove it.
 """
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,14 +18,7 @@ from scipy import special
 from pipeline.drift_test import DriftTestParameters, Expectation
 from pipeline.errors import InputError
 from pipeline.records import Floats
-from pipeline.road_samples import (
-    RoadSample,
-    Scatter,
-    WindowEstimates,
-    sample_of,
-    scatter_of,
-    stretches_of,
-)
+from pipeline.road_samples import RoadSample, Scatter, Street, WindowEstimates, samples_of, stretches_of
 from pipeline.run_tail import Tail, tail_of, unknown_tail
 
 PRIOR_SCENES = 8.0
@@ -46,20 +40,20 @@ class Baseline:
         bias: float64 (6,), estimate of the unmoved mount against the stored extrinsic.
         covariance: float64 (6,6), of the bias.
         spread: float64 (6,6), covariance of what the scene adds, drawn towards the floor for any rig.
-        departure: float64 (6,), largest departure of a stretch from the bias beyond two sigma of its own.
-        deviation: float64 (6,), standard deviation of the stretches' means; 0 for one stretch.
+        deviation: float64 (6,), root mean square of the windows from the bias.
+        own: float64 (6,), root mean square of the windows' stated sigma: what of that is not the scene.
         scatter: Random error of windows inside a stretch.
-        stretches: The samples, sorted by recording.
+        stretches: The samples in short, sorted by recording.
         tail: Of the joint statistic over healthy stretches: what a wanted run length takes.
     """
 
     bias: Floats
     covariance: Floats
     spread: Floats
-    departure: Floats
     deviation: Floats
+    own: Floats
     scatter: Scatter
-    stretches: tuple[RoadSample, ...]
+    stretches: tuple[Street, ...]
     tail: Tail
 
     @property
@@ -84,10 +78,12 @@ class Baseline:
         return dataclasses.replace(parameters, alarm=max(self.tail.threshold, parameters.suspicion))
 
     def _bound(self, bound: Floats) -> Floats:
-        """b_j (6,): narrowed to what the stretches are sure to keep, widened to what one did not keep."""
-        if self._support > 1:
-            bound = np.minimum(bound, tolerance_factor(self._support) * self.deviation)
-        return np.maximum(bound, self.departure)
+        """b_j (6,): narrowed to what 95 % of streets surely keep, widened to what they surely do not."""
+        if self._support == 1:
+            return bound
+        bound = np.minimum(bound, tolerance_factor(self._support) * self.deviation)
+        scene = np.sqrt(np.maximum(self.deviation**2 - self.own**2, 0.0))
+        return np.maximum(bound, exceeded_factor(self._support) * scene)
 
 
 def tolerance_factor(count: int) -> float:
@@ -98,6 +94,12 @@ def tolerance_factor(count: int) -> float:
     quantile = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
     low = float(special.chdtri(count - 1, _CONFIDENCE))
     return quantile * math.sqrt((count - 1) * (1.0 + 1.0 / count) / low)
+
+
+def exceeded_factor(count: int) -> float:
+    """Standard deviations of ``count`` samples that 5 % of all others exceed, with 95 % confidence."""
+    quantile = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
+    return quantile * math.sqrt((count - 1) / float(special.chdtri(count - 1, 1.0 - _CONFIDENCE)))
 
 
 def supported_floor(spread: Floats, floor: Floats, count: int) -> Floats:
@@ -133,29 +135,41 @@ def learn(
     Raises:
         InputError: There is no window at all.
     """
-    parts = [part for drive in sorted(drives, key=lambda d: d.recording) for part in stretches_of(drive)]
-    if not parts:
+    samples, scatter = samples_of(drives)
+    if not samples:
         raise InputError("no window was judged in any recording", hint="longer healthy recordings")
-    scatter = scatter_of(parts)
-    stretches = tuple(sample_of(part, scatter) for part in parts)
-    bias, covariance, spread = _fitted(stretches, parameters.floor())
-    means = np.array([stretch.mean for stretch in stretches])
-    own = 2.0 * np.sqrt([np.diag(stretch.covariance) for stretch in stretches])
-    deviation = means.std(axis=0, ddof=1) if len(means) > 1 else np.zeros(6)
+    fit = _fitted(samples, parameters.floor())
+    weights = _weights(samples)
+    away = np.concatenate([sample.drift for sample in samples]) - fit.bias
+    variances = np.concatenate([sample.covariance for sample in samples]).diagonal(axis1=1, axis2=2)
     return Baseline(
-        bias=bias,
-        covariance=covariance,
-        spread=spread,
-        departure=np.maximum(np.abs(means - bias) - own, 0.0).max(axis=0),
-        deviation=np.asarray(deviation, dtype=np.float64),
+        bias=fit.bias,
+        covariance=fit.covariance,
+        spread=fit.spread,
+        deviation=np.sqrt(weights @ away**2 / max(len(samples) - 1, 1)),
+        own=np.sqrt(weights @ variances / len(samples)),
         scatter=scatter,
-        stretches=stretches,
-        tail=_tail(parts, stretches, scatter, parameters, (wanted_s, rng)),
+        stretches=tuple(sample.street for sample in samples),
+        tail=_tail(drives, samples, scatter, parameters, (wanted_s, rng)),
     )
 
 
-def _fitted(stretches: Sequence[RoadSample], floor: Floats) -> tuple[Floats, Floats, Floats]:
-    """Bias (6,), its covariance (6,6), and spread (6,6) by restricted expectation and maximisation.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Bias (6,), its covariance (6,6), and the spread (6,6)."""
+
+    bias: Floats
+    covariance: Floats
+    spread: Floats
+
+
+def _weights(samples: Sequence[RoadSample]) -> Floats:
+    """Weight of each window: those of one stretch weigh 1 together."""
+    return np.concatenate([np.full(len(sample.drift), 1.0 / len(sample.drift)) for sample in samples])
+
+
+def _fitted(samples: Sequence[RoadSample], floor: Floats) -> _Fit:
+    """Bias, its covariance, and spread by restricted expectation and maximisation.
 
     The spread's prior is inverse Wishart about ``floor`` with the weight of ``PRIOR_SCENES`` stretches. With
     exact means it comes to ``(8 floor + sum of squares) / (8 + n - 1)``: one stretch says nothing of it.
@@ -163,27 +177,30 @@ def _fitted(stretches: Sequence[RoadSample], floor: Floats) -> tuple[Floats, Flo
     # Whitened by the floor: radians and metres of one size, and the prior the unit matrix.
     root = np.linalg.cholesky(floor)
     unwhiten = np.linalg.inv(root)
-    means = np.array([s.mean for s in stretches]) @ unwhiten.T
-    noises = unwhiten @ np.array([s.covariance for s in stretches]) @ unwhiten.T
+    values = np.concatenate([sample.drift for sample in samples]) @ unwhiten.T
+    noises = unwhiten @ np.concatenate([sample.covariance for sample in samples]) @ unwhiten.T
+    weights = _weights(samples)
     spread = np.eye(6)
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if len(samples) > 1 else 0):
         precision = np.linalg.inv(spread + noises)
-        covariance = np.linalg.inv(precision.sum(axis=0))
-        bias = covariance @ np.einsum("nij,nj->i", precision, means)
+        bias, covariance = _mean(weights, precision, values)
         gain = spread @ precision
-        scene = np.einsum("nij,nj->ni", gain, means - bias)
+        scene = np.einsum("nij,nj->ni", gain, values - bias)
         left = spread - gain @ spread + gain @ covariance @ gain.transpose(0, 2, 1)
-        renewed = (PRIOR_SCENES * np.eye(6) + scene.T @ scene + left.sum(axis=0)) / (
-            PRIOR_SCENES + len(stretches)
-        )
+        squares = (weights * scene.T) @ scene + np.einsum("n,nij->ij", weights, left)
+        renewed = (PRIOR_SCENES * np.eye(6) + squares) / (PRIOR_SCENES + len(samples))
         change = float(np.abs(renewed - spread).max() / np.abs(spread).max())
         spread = 0.5 * (renewed + renewed.T)
         if change < _SETTLED:
             break
-    precision = np.linalg.inv(spread + noises)
-    covariance = np.linalg.inv(precision.sum(axis=0))
-    bias = covariance @ np.einsum("nij,nj->i", precision, means)
-    return root @ bias, root @ covariance @ root.T, root @ spread @ root.T
+    bias, covariance = _mean(weights, np.linalg.inv(spread + noises), values)
+    return _Fit(root @ bias, root @ covariance @ root.T, root @ spread @ root.T)
+
+
+def _mean(weights: Floats, precision: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Weighted mean by information (6,), and its covariance (6,6)."""
+    covariance = np.linalg.inv(np.einsum("n,nij->ij", weights, precision))
+    return covariance @ np.einsum("n,nij,nj->i", weights, precision, values, optimize=True), covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,21 +220,20 @@ class LeftOut:
     statistic: float
 
 
-def left_out(stretches: Sequence[RoadSample], parameters: DriftTestParameters) -> tuple[LeftOut, ...]:
+def left_out(drives: Sequence[WindowEstimates], parameters: DriftTestParameters) -> tuple[LeftOut, ...]:
     """Each recording against the baseline of all others; nothing where there is only one recording.
 
     However long it is, a recording counts as one scene: it has one load, weather, and traffic.
     """
-    names = sorted({stretch.recording for stretch in stretches})
+    samples, _ = samples_of(drives)
     results = []
-    for name in names if len(names) > 1 else ():
-        own = [stretch for stretch in stretches if stretch.recording == name]
-        others = [stretch for stretch in stretches if stretch.recording != name]
-        bias, covariance, spread = _fitted(others, parameters.floor())
-        floor = supported_floor(spread, parameters.floor(), len(others))
-        mean, random = _joined(own)
-        P = random + floor + covariance
-        difference = mean - bias
+    for name, own, others in _split(samples):
+        fit = _fitted(others, parameters.floor())
+        weights = _weights(own)
+        precision = np.linalg.inv(np.concatenate([sample.covariance for sample in own]))
+        mean, random = _mean(weights / weights.sum(), precision, np.concatenate([s.drift for s in own]))
+        P = random + supported_floor(fit.spread, parameters.floor(), len(others)) + fit.covariance
+        difference = mean - fit.bias
         results.append(
             LeftOut(
                 recording=name,
@@ -229,17 +245,17 @@ def left_out(stretches: Sequence[RoadSample], parameters: DriftTestParameters) -
     return tuple(results)
 
 
-def _joined(stretches: Sequence[RoadSample]) -> tuple[Floats, Floats]:
-    """Mean of several stretches by information, and its random covariance."""
-    information = np.linalg.inv([stretch.covariance for stretch in stretches])
-    covariance = np.linalg.inv(information.sum(axis=0))
-    means = np.array([stretch.mean for stretch in stretches])
-    return covariance @ np.einsum("nij,nj->i", information, means), covariance
+def _split(samples: Sequence[RoadSample]) -> Iterator[tuple[str, list[RoadSample], list[RoadSample]]]:
+    """Each recording by name with its own samples and those of all others; nothing of a single one."""
+    names = sorted({sample.street.recording for sample in samples})
+    for name in names if len(names) > 1 else ():
+        own = [sample for sample in samples if sample.street.recording == name]
+        yield name, own, [sample for sample in samples if sample.street.recording != name]
 
 
 def _tail(
-    parts: Sequence[WindowEstimates],
-    stretches: Sequence[RoadSample],
+    drives: Sequence[WindowEstimates],
+    samples: Sequence[RoadSample],
     scatter: Scatter,
     parameters: DriftTestParameters,
     wanted: tuple[float, np.random.Generator],
@@ -249,31 +265,30 @@ def _tail(
     Unknown where there is only one recording: against its own mean a drive looks better than it is.
     """
     wanted_s, rng = wanted
-    seconds = np.array([stretch.seconds for stretch in stretches])
+    seconds = np.array([sample.street.seconds for sample in samples])
     unknown = unknown_tail(seconds, wanted_s)
-    if len(stretches) < unknown.needed or len({stretch.recording for stretch in stretches}) == 1:
+    if len(samples) < unknown.needed or len({sample.street.recording for sample in samples}) == 1:
         return unknown
-    return tail_of(_largest_statistics(parts, stretches, scatter, parameters), seconds, wanted_s, rng)
+    return tail_of(_largest_statistics(drives, samples, scatter, parameters), seconds, wanted_s, rng)
 
 
 def _largest_statistics(
-    parts: Sequence[WindowEstimates],
-    stretches: Sequence[RoadSample],
+    drives: Sequence[WindowEstimates],
+    samples: Sequence[RoadSample],
     scatter: Scatter,
     parameters: DriftTestParameters,
 ) -> Floats:
     """Per stretch the largest joint statistic of its windows against the baseline of other recordings."""
     floor = parameters.floor()
-    largest = np.zeros(0)
-    for name in sorted({stretch.recording for stretch in stretches}):
-        others = [stretch for stretch in stretches if stretch.recording != name]
-        bias, covariance, spread = _fitted(others, floor)
-        common = supported_floor(spread, floor, len(others)) + covariance
-        for part in parts:
-            if part.recording == name:
-                P = max(scatter.noise, 1.0) ** 2 * part.covariance + common
-                P = P + part.feigned[:, :, None] * part.feigned[:, None, :]
-                away = part.drift - bias
-                solved = np.linalg.solve(P, away[:, :, None])[:, :, 0]
-                largest = np.append(largest, np.einsum("ni,ni->n", away, solved).max())
-    return largest
+    by_name = {drive.recording: drive for drive in drives}
+    largest = []
+    for name, _, others in _split(samples):
+        fit = _fitted(others, floor)
+        common = supported_floor(fit.spread, floor, len(others)) + fit.covariance
+        for part in stretches_of(by_name[name]):
+            P = max(scatter.noise, 1.0) ** 2 * part.covariance + common
+            P = P + part.feigned[:, :, None] * part.feigned[:, None, :]
+            away = part.drift - fit.bias
+            solved = np.linalg.solve(P, away[:, :, None])[:, :, 0]
+            largest.append(float(np.einsum("ni,ni->n", away, solved).max()))
+    return np.array(largest)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from pipeline.records import Floats, read_only
 
@@ -26,10 +27,16 @@ _SHORTEST_CORRELATION_M = 20.0
 """m; edges lie 40 m ahead, so what is seen now is seen until half of that is driven (NEW_SCENE_M)."""
 
 _CORRELATIONS = 16
-"""Correlation lengths that are tried, from the shortest to ``STRETCH_M``, each 1.17 times the one before."""
+"""Correlation lengths that are tried, from the shortest to four times it."""
 
 _LEAST_WINDOWS = 3
 """Windows on each side of a change: one alone may lie in a false mode."""
+
+_NOISE_LENGTHS = 2.0
+"""Shortest correlation lengths in a segment that tells the noise: over more road the scene wanders."""
+
+_SCENE_LENGTHS = 4.0
+"""The same for the correlation: 80 m, as on the drives whose correlation is known (PROBE 4)."""
 
 _PRIOR_DRIVES = 4.0
 """Drives on which the stated sigma was measured (PROBE 4): as many samples as stand behind a noise of 1."""
@@ -88,26 +95,39 @@ class Scatter:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RoadSample:
-    """One stretch of road: one sample of the scene.
+class Street:
+    """One stretch of road in short.
 
     Attributes:
         recording: Name of the drive that it is part of.
-        mean: float64 (6,), mean estimate, weighted by information; rad and m.
-        covariance: float64 (6,6), of its random error.
-        windows: Windows, at least ``_APART_M`` apart.
-        samples: Independent windows that they are worth.
+        mean: float64 (6,), mean estimate of its windows; rad and m.
+        windows: Windows that share no frame.
+        samples: Independent windows that all its windows are worth.
         way_m: Way from the first frame to the last, m.
         seconds: Time from the first window to the last, s.
     """
 
     recording: str
     mean: Floats
-    covariance: Floats
     windows: int
     samples: float
     way_m: float
     seconds: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadSample:
+    """One stretch of road: one sample of the scene, however many windows show how it pulls.
+
+    Attributes:
+        street: The stretch in short.
+        drift: float64 (K,6), estimates of windows that share no frame.
+        covariance: float64 (K,6,6), of their error apart from the scene: random, and of the clocks.
+    """
+
+    street: Street
+    drift: Floats
+    covariance: Floats
 
 
 def stretches_of(drive: WindowEstimates) -> list[WindowEstimates]:
@@ -141,30 +161,55 @@ def _apart(drive: WindowEstimates) -> WindowEstimates:
     return drive.chosen(np.array(kept[::-1]))
 
 
-def scatter_of(stretches: Sequence[WindowEstimates]) -> Scatter:
-    """Noise and correlation of windows inside stretches, each stretch with a mean of its own.
+def scatter_of(drives: Sequence[WindowEstimates]) -> Scatter:
+    """Noise and correlation of windows within segments of drives, each segment with a mean of its own.
 
-    Errors are taken as ``noise^2`` times the stated covariance, alike as ``exp(-way / correlation_m)`` (AR(1)
-    over the way driven, FORMULAS F1). The length is that of the largest restricted likelihood; it is at least
-    half a window, for windows that share frames are alike. The noise is drawn to 1 by the drives on which the
-    stated sigma was measured: two windows more do not prove it wrong.
+    Errors are taken as ``noise^2`` times the stated covariance, alike as ``exp(-way / length)`` (AR(1) over
+    the way, FORMULAS F1). The noise is what renews itself as fast as the windows do, so its length is half
+    a window or the shortest: what wanders more slowly is the scene. It is the median over segments, for the
+    scene changes within some, drawn to 1 by the drives on which the stated sigma was measured. The
+    correlation is that of all together, of the largest restricted likelihood.
     """
-    spans = [np.median(part.way_m[:, 1] - part.way_m[:, 0]) for part in stretches]
+    spans = [np.median(part.way_m[:, 1] - part.way_m[:, 0]) for part in drives]
     shortest = max(_SHORTEST_CORRELATION_M, 0.5 * float(np.median(spans)))
-    degrees = 6 * sum(len(part) - 1 for part in stretches)
-    if degrees == 0:
+    near, far = (
+        [part for drive in drives for part in _segments(drive, lengths * shortest) if len(part) > 1]
+        for lengths in (_NOISE_LENGTHS, _SCENE_LENGTHS)
+    )
+    if not near:
         return Scatter(noise=1.0, correlation_m=shortest)
-    best, length, variance = -math.inf, shortest, 1.0
-    for tried in np.geomspace(shortest, max(STRETCH_M, shortest), _CORRELATIONS):
-        fits = [_restricted(part, float(tried)) for part in stretches if len(part) > 1]
-        squares = sum(fit[0] for fit in fits)
-        # Estimates that repeat each other to the last digit must not make the logarithm infinite.
-        likelihood = -0.5 * (sum(fit[1] for fit in fits) + degrees * math.log(squares / degrees + 1e-300))
-        if likelihood > best:
-            best, length, variance = likelihood, float(tried), squares / degrees
-    samples = sum(effective_samples(part.way_m[:, 1], length) - 1.0 for part in stretches)
+    degrees = np.array([6 * (len(part) - 1) for part in near])
+    scales = np.array([_restricted(part, shortest)[0] for part in near]) / special.chdtri(degrees, 0.5)
+    samples = sum(effective_samples(part.way_m[:, 1], shortest) - 1.0 for part in near)
+    variance = _weighted_median(scales, degrees)
     noise = math.sqrt((_PRIOR_DRIVES + samples * variance) / (_PRIOR_DRIVES + samples))
-    return Scatter(noise=noise, correlation_m=length)
+    lengths = np.geomspace(shortest, _SCENE_LENGTHS * shortest, _CORRELATIONS)
+    likelihoods = [_likelihood(far, float(length)) for length in lengths]
+    return Scatter(noise=noise, correlation_m=float(lengths[int(np.argmax(likelihoods))]))
+
+
+def _likelihood(parts: Sequence[WindowEstimates], length_m: float) -> float:
+    """Logarithm of the restricted likelihood of a correlation length, each part with a noise of its own."""
+    total = 0.0
+    for part in parts:
+        degrees = 6 * (len(part) - 1)
+        squares, log_determinant = _restricted(part, length_m)
+        # Estimates that repeat each other to the last digit must not make the logarithm infinite.
+        total -= 0.5 * (log_determinant + degrees * math.log(squares / degrees + 1e-300))
+    return total
+
+
+def _segments(drive: WindowEstimates, length_m: float) -> list[WindowEstimates]:
+    """The windows of a drive by the segment of road in which they end."""
+    drive = _apart(drive)
+    number = ((drive.way_m[:, 1] - drive.way_m[0, 1]) // length_m).astype(np.int64)
+    return [drive.chosen(number == index) for index in np.unique(number)]
+
+
+def _weighted_median(values: Floats, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    half = np.searchsorted(np.cumsum(weights[order]), 0.5 * weights.sum())
+    return float(values[order][half])
 
 
 def _restricted(part: WindowEstimates, length_m: float) -> tuple[float, float]:
@@ -199,28 +244,42 @@ def effective_samples(way_m: Floats, length_m: float) -> float:
     return len(way_m) ** 2 / float(_alike(way_m, length_m).sum())
 
 
-def sample_of(part: WindowEstimates, scatter: Scatter) -> RoadSample:
-    """Mean of a stretch, its random error, and what it is worth.
+def samples_of(drives: Sequence[WindowEstimates]) -> tuple[tuple[RoadSample, ...], Scatter]:
+    """The stretches of all drives as samples, sorted by recording, and how their windows scatter."""
+    ordered = sorted((drive for drive in drives if len(drive) > 0), key=lambda drive: drive.recording)
+    if not ordered:
+        return (), Scatter(noise=1.0, correlation_m=_SHORTEST_CORRELATION_M)
+    scatter = scatter_of(ordered)
+    return tuple(_sample(part, scatter) for drive in ordered for part in stretches_of(drive)), scatter
 
-    An error in the time between sweep and image is the same all along: it is not divided by anything.
-    """
-    roots = _inverse_roots(part.covariance)
-    information = roots @ roots
-    total = np.linalg.inv(information.sum(axis=0))
-    mean = total @ np.einsum("nij,nj->i", information, part.drift)
-    feigned = total @ np.einsum("nij,nj->i", information, part.feigned)
-    alike = _alike(part.way_m[:, 1], scatter.correlation_m)
-    pull = np.einsum("nij,nm,mjk->ik", roots, alike, roots, optimize=True)
-    covariance = scatter.noise**2 * total @ pull @ total + np.outer(feigned, feigned)
-    return RoadSample(
+
+def _sample(part: WindowEstimates, scatter: Scatter) -> RoadSample:
+    """A stretch as a sample: its windows that share no frame, from the last one back, which saw most."""
+    kept: list[int] = []
+    for index in range(len(part) - 1, -1, -1):
+        if not kept or part.way_m[index, 1] <= part.way_m[kept[-1], 0]:
+            kept.append(index)
+    chosen = part.chosen(np.array(kept[::-1]))
+    clocks = chosen.feigned[:, :, None] * chosen.feigned[:, None, :]
+    street = Street(
         recording=part.recording,
-        mean=np.asarray(mean, dtype=np.float64),
-        covariance=0.5 * (covariance + covariance.T),
-        windows=len(part),
+        mean=np.asarray(chosen.drift.mean(axis=0), dtype=np.float64),
+        windows=len(chosen),
         samples=effective_samples(part.way_m[:, 1], scatter.correlation_m),
         way_m=float(part.way_m[:, 1].max() - part.way_m[:, 0].min()),
         seconds=float(part.stamp_ns[-1] - part.stamp_ns[0]) / 1e9,
     )
+    return RoadSample(street, chosen.drift, scatter.noise**2 * chosen.covariance + clocks)
+
+
+def mean_of(drive: WindowEstimates) -> tuple[Floats, Floats]:
+    """Mean (6,) of a drive's windows by information, and its covariance (6,6): no surer than one window."""
+    information = np.linalg.inv(drive.covariance)
+    total = np.linalg.inv(information.sum(axis=0))
+    mean, clock = (
+        total @ np.einsum("nij,nj->i", information, values) for values in (drive.drift, drive.feigned)
+    )
+    return mean, len(drive) * total + np.outer(clock, clock)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

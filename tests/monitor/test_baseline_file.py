@@ -57,7 +57,7 @@ def test_what_is_written_is_read_again(file):
     (pair,) = with_baselines(RIG, file).pairs
     found, wanted = pair.baseline, learned()
     assert found is not None
-    for name in ("bias", "covariance", "spread", "departure", "deviation"):
+    for name in ("bias", "covariance", "spread", "deviation", "own"):
         assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-12, abs=1e-18)
     assert (found.scatter.noise, found.scatter.correlation_m) == (
         wanted.scatter.noise,
@@ -117,7 +117,7 @@ def _lopsided(part):
 
 
 def _flat(part):
-    part["stretches"][0]["covariance"] = [[0.0] * 6 for _ in range(6)]
+    part["covariance"] = [[0.0] * 6 for _ in range(6)]
 
 
 def _singular(part):
@@ -159,7 +159,7 @@ def test_other_content_is_refused(tmp_path, text, what):
         ("correlation_m", -1.0),
         ("extrinsic", "abc"),
         ("stretches", []),
-        ("departure", [-1.0] * 6),
+        ("deviation", [-1.0] * 6),
         ("more", 1),
     ],
 )

@@ -21,7 +21,7 @@ def simulated_drive(
     bias=None,
     spread=None,
     noise=1.0,
-    correlation_m=30.0,
+    correlation_m=20.0,
     way_m=200.0,
     step_m=8.0,
     window_m=30.0,

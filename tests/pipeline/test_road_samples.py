@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from pipeline.road_samples import (
     STRETCH_M,
-    Scatter,
     WindowEstimates,
     effective_samples,
     largest_change,
-    sample_of,
+    mean_of,
+    samples_of,
     scatter_of,
     stretches_of,
 )
@@ -46,21 +46,24 @@ def test_the_worth_of_a_long_drive_is_that_of_the_long_run_variance(phi):
     assert worth / count == pytest.approx((1 - phi) / (1 + phi), rel=0.01)  # FORMULAS F1
 
 
-def test_noise_and_correlation_of_simulated_drives_are_recovered():
+def test_the_noise_of_simulated_drives_is_recovered():
     rng = np.random.default_rng(1)
-    parts = [
-        simulated_drive(rng, f"{i}", noise=1.7, correlation_m=50.0, way_m=900.0, step_m=6.0)
-        for i in range(20)
-    ]
+    parts = [simulated_drive(rng, f"{i}", noise=1.7, way_m=600.0, step_m=6.0) for i in range(12)]
+    assert scatter_of(parts).noise == pytest.approx(1.7, rel=0.08)
+
+
+def test_the_correlation_of_simulated_drives_is_recovered():
+    rng = np.random.default_rng(2)
+    parts = [simulated_drive(rng, f"{i}", correlation_m=45.0, way_m=600.0, step_m=6.0) for i in range(20)]
     found = scatter_of(parts)
-    assert found.noise == pytest.approx(1.7, rel=0.06)
-    assert found.correlation_m == pytest.approx(50.0, rel=0.2)
+    assert found.correlation_m == pytest.approx(45.0, rel=0.3)
+    assert found.noise < 1.0  # what wanders slowly is the scene
 
 
 def test_two_windows_that_differ_much_do_not_prove_the_stated_sigma_wrong():
     drift = np.zeros((2, 6))
     drift[1] = 4.0 * np.sqrt(np.diag(RANDOM))
-    assert 1.0 < scatter_of([windows([100.0, 200.0], drift=drift)]).noise < 2.0
+    assert 1.0 < scatter_of([windows([100.0, 135.0], drift=drift)]).noise < 2.0
 
 
 def test_single_windows_tell_nothing_of_the_noise():
@@ -76,33 +79,35 @@ def test_windows_are_alike_at_least_over_half_their_length():
     assert scatter_of(parts).correlation_m == pytest.approx(60.0)
 
 
-def test_the_error_of_a_mean_is_that_of_the_model():
-    """Against the covariance of the weighted mean, spelt out window by window."""
+def test_a_sample_holds_windows_that_share_no_frame_the_last_among_them():
     rng = np.random.default_rng(3)
-    way = np.array([40.0, 55.0, 90.0, 130.0])
-    factors = rng.uniform(0.5, 2.0, 4)
-    covariance = factors[:, None, None] * RANDOM
-    part = windows(way, drift=rng.normal(size=(4, 6)) * 1e-3, covariance=covariance)
-    sample = sample_of(part, Scatter(noise=1.3, correlation_m=35.0))
-    weights = (1 / factors) / (1 / factors).sum()
-    assert sample.mean == pytest.approx(weights @ part.drift)
-    variance = sum(
-        weights[i] * weights[j] * np.sqrt(factors[i] * factors[j]) * np.exp(-abs(way[i] - way[j]) / 35.0)
-        for i in range(4)
-        for j in range(4)
-    )
-    assert sample.covariance == pytest.approx(1.3**2 * variance * RANDOM)
-    assert sample.windows == 4
-    assert 1.0 < sample.samples < 4.0
+    way = np.array([40.0, 55.0, 70.0, 110.0, 150.0])
+    part = windows(way, span_m=30.0, drift=rng.normal(size=(5, 6)) * 1e-3)
+    (sample,), scatter = samples_of([part])
+    assert sample.drift == pytest.approx(part.drift[[0, 2, 3, 4]])
+    assert sample.covariance == pytest.approx(np.tile(scatter.noise**2 * RANDOM, (4, 1, 1)))
+    assert sample.street.mean == pytest.approx(part.drift[[0, 2, 3, 4]].mean(axis=0))
+    assert sample.street.windows == 4
+    assert 1.0 < sample.street.samples < 5.0
+    assert sample.street.way_m == pytest.approx(140.0)
 
 
-def test_an_error_of_the_clocks_is_not_averaged_away():
-    part = windows(np.arange(100) * 50.0)
+def test_an_error_of_the_clocks_is_part_of_a_sample_and_not_averaged_away():
     clock = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
-    fooled = WindowEstimates(
-        "drive", part.drift, part.covariance, np.tile(clock, (100, 1)), part.way_m, part.stamp_ns
-    )
-    assert sample_of(fooled, Scatter(1.0, 20.0)).covariance[3, 3] > 0.1**2
+    part = windows(np.arange(1, 101) * 50.0)
+    fooled = dataclasses.replace(part, feigned=np.tile(clock, (100, 1)))
+    samples, scatter = samples_of([fooled])
+    for sample in samples:
+        assert sample.covariance == pytest.approx(
+            np.tile(scatter.noise**2 * RANDOM + np.outer(clock, clock), (len(sample.drift), 1, 1))
+        )
+    mean, covariance = mean_of(fooled)
+    assert mean == pytest.approx(np.zeros(6))
+    assert covariance == pytest.approx(RANDOM + np.outer(clock, clock))
+
+
+def test_no_drive_gives_no_sample():
+    assert samples_of([windows([])])[0] == ()
 
 
 @given(

@@ -113,7 +113,7 @@ class EdgeBatch:
 
 
 def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel, most_edges: int) -> EdgeBatch:
-    """Joins frames of one camera, at least one; every n-th edge where there are more than ``most_edges``."""
+    """Joins frames of one camera, at least one; ``most_edges`` of all edges, evenly, where there are more."""
     total = sum(len(f.edges) for f in frames)
     stretches = [int((f.distance_m - frames[0].distance_m) // NEW_SCENE_M) for f in frames]
     levels = range(len(frames[0].gradients.levels))
@@ -131,7 +131,9 @@ def batch_of(frames: Sequence[EdgeFrame], camera: CameraModel, most_edges: int) 
         camera=camera,
         stamps_ns=tuple(f.stamp_ns for f in frames),
     )
-    return whole.thinned(max(1, -(-total // most_edges)))
+    # Evenly: with every second edge or every third a window would know less for one frame more.
+    kept = min(total, most_edges)
+    return whole._picked(np.arange(kept) * total // max(kept, 1))  # noqa: SLF001 - of its own kind
 
 
 def seen_from(batch: EdgeBatch, extrinsics: Sequence[Floats]) -> EdgeBatch:

@@ -177,8 +177,8 @@ def _preferred(
     for top, gain in rivals:
         if not _near(top[0], parameters) or top[1] <= best[1]:
             continue
-        wanted, gain = (0.0, 0.0) if lost else (parameters.least_preference, gain)
-        clearly = top[1] > best[1] * (1.0 + gain)
+        clearly = lost or top[1] > best[1] * (1.0 + gain)
+        wanted = 0.0 if lost else parameters.least_preference
         if clearly and _prefer(batch, T_stored, (top[0], best[0])) > wanted:
             best, kept = top, Rival(top[0], gain)
     return best, () if kept is None else (kept,)

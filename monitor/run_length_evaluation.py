@@ -43,7 +43,7 @@ SIZES: tuple[tuple[float, ...], tuple[float, ...]] = ((0.1, 0.25, 0.5), (0.05, 0
 
 RAMP_DEG_PER_MINUTE = 0.05
 
-STREET_SHARE = 0.25
+STREET_SHARE = 0.4
 """Sigmas of what simulated streets differ by over those of the floor (``evidence_fit``)."""
 
 _BASELINE_STREETS = 12

@@ -61,7 +61,7 @@ def _healthy_lines(found: Healthy) -> list[str]:
     middle, low, high = (_YEAR_H * value for value in found.extrapolated_hourly)
     rate = f"{middle:.2g} false alarms in a vehicle-year of {_YEAR_H:.0f} h"
     interval = f"90 % interval {low:.2g} to {high:.2g}"
-    tail = f"Extrapolated, not counted, from peaks above {found.extrapolated_from:g} to the level"
+    tail = f"Extrapolated, not counted, from peaks above {found.extrapolated_from:.1f} to the level"
     return [*lines, "", f"{tail}: {rate}, {interval}."]
 
 

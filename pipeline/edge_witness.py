@@ -164,7 +164,7 @@ def solve(
     penalty = _PENALTY * float(inside @ np.linalg.solve(floor, inside))
     return EdgeSolution(
         xi=xi,
-        covariance=_covariance(batch, H, share, parameters),
+        covariance=sandwich(batch, H, share, parameters),
         score=value,
         score_stored=stored[0],
         contrast=best / background - 1.0 if background > 0 else 0.0,
@@ -290,17 +290,29 @@ def _best_inside(
     return np.asarray(found * UNITS, dtype=np.float64)
 
 
-def _covariance(batch: EdgeBatch, H: Floats, share: Floats, parameters: EdgeWitnessParameters) -> Floats:
-    """H^-1 G H^-1 with G summed over image cells across all frames (PROBE 4 c), times sigma_factor^2."""
-    values, vectors = np.linalg.eigh(H)
-    values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
-    H_inverse = (vectors / values) @ vectors.T
+def sandwich(batch: EdgeBatch, H: Floats, share: Floats, parameters: EdgeWitnessParameters) -> Floats:
+    """H^-1 G H^-1 with G summed over image cells across all frames (PROBE 4 c), times sigma_factor^2.
+
+    Args:
+        batch: Edges.
+        H: float64 (6,6), minus the Hessian of the score at a maximum, alert units.
+        share: float64 (N,6), what :func:`edge_score.score` gives there.
+        parameters: See there.
+    """
+    H_inverse = inverse_curvature(H, parameters)
     cells = np.stack([np.bincount(batch.cell, weights=column) for column in (share * UNITS).T])
     G = cells @ cells.T
     C = H_inverse @ G @ H_inverse * parameters.sigma_factor**2
     # A direction that no cell pulls on has no stated error; the floor of H alone bounds it.
     C = C + 1e-8 * np.eye(6)
     return np.asarray(UNITS[:, None] * C * UNITS[None, :], dtype=np.float64)
+
+
+def inverse_curvature(H: Floats, parameters: EdgeWitnessParameters) -> Floats:
+    """H^-1 with the eigenvalues of H floored, float64 (6,6): alert units per slope."""
+    values, vectors = np.linalg.eigh(H)
+    values = np.maximum(values, parameters.eigenvalue_floor * max(float(values.max()), 1e-9))
+    return np.asarray((vectors / values) @ vectors.T, dtype=np.float64)
 
 
 def information_of(frame: EdgeFrame, camera: CameraModel, T_cam_lidar: Floats) -> Floats:

@@ -55,14 +55,17 @@ class VerdictParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steady:
-    """What all scenes of a drive together say of a small steady drift (``scene_sum``).
+    """What is said of a drift beside the window as a whole.
+
+    All scenes of a drive speak of a small steady one (``scene_sum``), the newest frames of a sudden one
+    (``shock``).
 
     Attributes:
         alarming: They say 'moved', at the run length that is wanted.
         suspicious: They want more evidence.
         drift: float64 (6,), rad and m, since then.
         sigma: float64 (6,), of it, the floor between scenes included.
-        scenes: Scenes heard.
+        over: What it was heard over: ``12 scenes``, ``the last 0.6 s``.
         onset: When it began.
     """
 
@@ -70,7 +73,7 @@ class Steady:
     suspicious: bool
     drift: Floats
     sigma: Floats
-    scenes: int
+    over: str
     onset: Onset
 
 
@@ -194,7 +197,7 @@ def advance(
         required: Axes that must be monitored for 'healthy'.
         limits: float64 (6,), alert limits.
         parameters: Hysteresis and patience.
-        steady: What all scenes of the drive together say, or None before the first.
+        steady: What all scenes of the drive, or the newest frames, say beside the window, or None.
         doubt: What else than the mount may have changed, or None.
     """
     now_ns = window_ns[1]
@@ -404,7 +407,7 @@ def _drift_reason(judgement: Judgement, limits: Floats) -> str:
 def _steady_reason(claim: str, steady: Steady, limits: Floats) -> str:
     axis = int(np.argmax(np.abs(steady.drift) / limits))
     size = _size_of(axis, float(steady.drift[axis]), float(steady.sigma[axis]))
-    return f"Over {steady.scenes} scenes the mount {claim}: {size}."
+    return f"Over {steady.over} the mount {claim}: {size}."
 
 
 def _unmonitored_reason(judgement: Judgement, axes: list[int]) -> str:

@@ -3,16 +3,18 @@
 Pure: no files, no clock. What a stage costs is measured by the caller through ``stage``.
 """
 
+import dataclasses
 from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import scene_sum, verdict, window
+from pipeline import scene_sum, se3, shock, verdict, window
 from pipeline.belief import Belief, believe
 from pipeline.candidate import Proposal, Proposer, moved_since
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
+from pipeline.edge_score import batch_of, mean_responses
 from pipeline.edge_witness import EdgeFrame
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, edge_frame, unmeasured
 from pipeline.inquiry import Inquiry
@@ -23,6 +25,7 @@ from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.scene_filter import Scene
 from pipeline.segmentation import Segmenter
+from pipeline.shock import Alertness
 
 _SCENE_STAMPS = 1024
 """Scenes whose stamps are kept: 20 km; a drift that began before is told to have begun before the data."""
@@ -90,6 +93,7 @@ class Watch:
         self._proposer = Proposer(mount, parameters)
         self.inquiry = Inquiry(mount, parameters)
         self.scenes = scene_sum.begin(mount.expectation(parameters.test))
+        self._alertness = Alertness()
         self._scene_stamps: deque[int] = deque(maxlen=_SCENE_STAMPS)
         self._begun_m: float | None = None
         self._begun_ns = 0
@@ -207,6 +211,7 @@ class Watch:
         self._scout.forget()
         self.breaks += 1
         self._proposer.forget()
+        self._alertness = Alertness()
         self._judged_ns = None
 
     def _looked_at(self, pair: FramePair, stage: Stage, foresight: Foresight | None) -> Findings:
@@ -220,6 +225,7 @@ class Watch:
             frame = edge_frame(pair, evidence.edges, evidence.straight, self.mount, stage)
             self._edge_frames.append(frame)
             self._dating.see(frame)
+            self._heed(frame)
             self.inquiry.see(now_ns, evidence.straight)
         if evidence.lines is not None:
             self._line_frames.append((now_ns, evidence.lines))
@@ -248,7 +254,8 @@ class Watch:
     def _judged(self, findings: Findings, now_ns: int, stage: Stage) -> Findings:
         assert self.memory is not None  # noqa: S101 - set on entry
         beginning = now_ns - self._begun_ns < self.parameters.window.beginning_ns
-        stirred = self.memory.state in ("suspect", "drifted") and self.memory.severity is None
+        stirred = self.memory.state in ("suspect", "drifted") or self._alertness.since_ns is not None
+        stirred = stirred and self.memory.severity is None
         frames = max(len(self._edge_frames), len(self._line_frames))
         due = window.judgement_due(
             now_ns,
@@ -266,7 +273,8 @@ class Watch:
         if self.belief is None:
             return findings
         self._sum_scene(self.belief, now_ns)
-        steady = self._steady()
+        with stage("shock"):
+            steady = self._shock(self.belief, now_ns) or self._steady()
         with stage("inquiry"):
             doubt = self.inquiry.ask(tuple(self._edge_frames), self.belief, self.memory, steady)
         self.memory = verdict.advance(
@@ -303,6 +311,44 @@ class Watch:
         self.scenes = scene_sum.advance(self.scenes, scene, expectation, self.parameters.scenes)
         self._scene_stamps.append(now_ns)
 
+    def _heed(self, frame: EdgeFrame) -> None:
+        """Notes how well a new frame fits what is believed."""
+        if self.belief is None or self.belief.edges is None or self.belief.judgement.blind:
+            self._alertness = Alertness()
+            return
+        batch = batch_of([frame], self.mount.camera, self.parameters.edge_witness.most_edges)
+        response = float(mean_responses(batch, [self.belief.T_estimated])[0, 0])
+        self._alertness = shock.heeded(
+            self._alertness, frame.stamp_ns, response, self.belief.edges.xi, self.parameters.shock
+        )
+
+    def _shock(self, belief: Belief, now_ns: int) -> verdict.Steady | None:
+        """What the newest frames say of a sudden move, once enough judgements in a row found it."""
+        settings, budget = self.parameters.shock, self.parameters.scenes.budget
+        if belief.edges is None:
+            return None
+        found = shock.find_shock(
+            tuple(self._edge_frames),
+            self._alertness,
+            self.mount.camera,
+            belief.edges.trail.T_stored,
+            self.parameters.edge_witness,
+            settings,
+        )
+        told = found is not None and shock.believed(found, budget, settings)
+        self._alertness = dataclasses.replace(self._alertness, found=self._alertness.found + 1 if told else 0)
+        if found is None or self._alertness.found < settings.confirmations:
+            return None
+        B = se3.vehicle_block(self.mount.R_vehicle_cam)
+        return verdict.Steady(
+            alarming=True,
+            suspicious=True,
+            drift=B @ found.xi,
+            sigma=np.sqrt(np.diag(B @ found.covariance @ B.T)),
+            over=f"the last {(now_ns - found.since_ns) / 1e9:.1f} s",
+            onset=Onset(found.since_ns, found.before_ns, found.since_ns),
+        )
+
     def _steady(self) -> verdict.Steady | None:
         """What all scenes so far say."""
         total, settings = self.scenes, self.parameters.scenes
@@ -315,7 +361,7 @@ class Watch:
             suspicious=scene_sum.suspicious(total, settings),
             drift=total.moved,
             sigma=np.sqrt(np.diag(total.moved_covariance)),
-            scenes=total.scenes,
+            over=f"{total.scenes} scenes" if total.scenes > 1 else "one scene",
             onset=Onset(since_ns, before_ns, since_ns),
         )
 

@@ -59,7 +59,7 @@ def after(memory, judged, now_ns, window_ns=3 * S, required=REQUIRED):
 
 def steady(yaw_deg, *, alarming=False, suspicious=True):
     drift = math.radians(yaw_deg) * np.eye(6)[2]
-    return Steady(alarming, suspicious, drift, np.full(6, 1e-3), 12, Onset(5 * S, 4 * S, 6 * S))
+    return Steady(alarming, suspicious, drift, np.full(6, 1e-3), "12 scenes", Onset(5 * S, 4 * S, 6 * S))
 
 
 def test_all_scenes_together_tell_what_no_window_does():

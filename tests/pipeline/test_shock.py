@@ -1,0 +1,130 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pipeline import se3, shock
+from pipeline.edge_search import EdgeWitnessParameters
+from pipeline.mount import Mount
+from pipeline.parameters import Parameters
+from pipeline.records import FramePair
+from pipeline.run_length import AlarmBudget
+from pipeline.shock import Alertness, ShockParameters, believed, find_shock, heeded
+from pipeline.watch import Watch
+
+P = ShockParameters()
+BUDGET = AlarmBudget()
+TENTH = 100_000_000
+ZERO = np.zeros(6)
+
+
+@pytest.fixture(scope="module")
+def second(drive, limits):
+    """The frames of a second of driving as a watch keeps them, and their mount."""
+    p = drive.parameters
+    mount = Mount(p.camera, p.T_stored, p.T_vehicle_lidar, math.radians(0.1), 0.02, limits, ("yaw", "pitch"))
+    rhythm = dataclasses.replace(Parameters().window, least_frames=10**6)
+    watch = Watch(mount, dataclasses.replace(Parameters(), window=rhythm), None)
+    for frame in (drive.frame(k) for k in range(len(drive))):
+        pair = FramePair("front", frame.cloud, frame.image, frame.cloud_stamp_ns, frame.image_stamp_ns, 0.1)
+        watch.step(pair)
+    return watch.edge_frames, mount
+
+
+def moved(frames, mount, step, first):
+    """The frames as if the mount had moved by ``step`` (6,), vehicle axes, before number ``first``."""
+    xi = se3.vehicle_block(mount.R_vehicle_cam).T @ step
+    M = se3.inverse(mount.T_cam_lidar) @ se3.retract(mount.T_cam_lidar, -xi)
+
+    def seen(frame):
+        position = se3.apply(M, frame.edges.position)
+        direction = frame.edges.direction @ M[:3, :3].T
+        edges = dataclasses.replace(frame.edges, position=position, direction=direction)
+        return dataclasses.replace(frame, edges=edges)
+
+    return [*frames[:first], *(seen(frame) for frame in frames[first:])]
+
+
+def found(frames, mount, step, first=5):
+    alertness = Alertness((), frames[first].stamp_ns, ZERO)
+    args = mount.camera, mount.T_cam_lidar, EdgeWitnessParameters(), P
+    return find_shock(moved(frames, mount, step, first), alertness, *args)
+
+
+def test_no_step_is_found_where_there_is_none(second):
+    nothing = found(*second, ZERO)
+    assert nothing.statistic < stats.chi2.isf(0.01, 6)
+    assert nothing.lost < P.least_lost
+    assert not believed(nothing, BUDGET, P)
+
+
+@pytest.mark.parametrize(("axis", "size"), [(2, 0.25), (1, -0.5), (3, 0.2), (4, 0.1), (5, -0.1)])
+def test_a_small_step_is_found_in_half_a_second_and_measured(second, axis, size):
+    frames, mount = second
+    step = (math.radians(size) if axis < 3 else size) * np.eye(6)[axis]
+    told = found(frames, mount, step)
+    assert believed(told, BUDGET, P)
+    assert (told.before_ns, told.since_ns) == (frames[4].stamp_ns, frames[5].stamp_ns)
+    B = se3.vehicle_block(mount.R_vehicle_cam)
+    error = B @ told.xi - step
+    assert np.abs(error[:3]).max() < math.radians(0.2)
+    assert np.abs(error[3:]).max() < 0.05
+    assert float(error @ np.linalg.solve(B @ told.covariance @ B.T, error)) < stats.chi2.isf(1e-3, 6)
+
+
+def test_a_mount_that_lies_elsewhere_in_each_frame_is_known_the_less(second):
+    frames, mount = second
+    calm = found(frames, mount, ZERO)
+    shaken = list(frames)
+    for number, size in enumerate([0.2, -0.15, 0.1, -0.2, 0.05, 0.15, -0.1, 0.2, -0.2, -0.05]):
+        shaken[number : number + 1] = moved([frames[number]], mount, math.radians(size) * np.eye(6)[1], 0)
+    wild = found(shaken, mount, ZERO)
+    assert not believed(wild, BUDGET, P)
+    assert wild.covariance[0, 0] > 1.5 * calm.covariance[0, 0]
+
+
+def test_a_side_with_too_few_frames_or_with_other_objects_says_nothing(second):
+    frames, mount = second
+    assert found(frames, mount, ZERO, first=4) is None
+    assert found(frames, mount, ZERO, first=6) is None
+    far = [dataclasses.replace(f, distance_m=f.distance_m - 50.0) for f in frames[:5]]
+    assert found([*far, *frames[5:]], mount, ZERO) is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"statistic": 45.0}, {"lost": 0.02}, {"preference": 1.9}], ids=["chance", "score", "cells"]
+)
+def test_each_doubt_alone_is_enough_not_to_believe_it(change):
+    sure = shock.Shock(ZERO, np.eye(6), statistic=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1)
+    assert stats.chi2.sf(46.0, 6) * BUDGET.yearly_scenes < BUDGET.yearly_alarms
+    assert believed(sure, BUDGET, P)
+    assert not believed(dataclasses.replace(sure, **change), BUDGET, P)
+
+
+def heard(responses, alertness=None, begin=0):
+    alertness = Alertness() if alertness is None else alertness
+    for number, response in enumerate(responses):
+        alertness = heeded(alertness, (begin + number) * TENTH, response, ZERO, P)
+    return alertness
+
+
+CALM = [0.30, 0.31, 0.29, 0.30, 0.32, 0.30, 0.29, 0.31]
+
+
+def test_responses_that_fall_together_open_the_search_at_the_first_of_them():
+    assert heard([*CALM, 0.30, 0.31, 0.29]).since_ns is None
+    assert heard([*CALM, 0.31, 0.30, 0.22]).since_ns is None
+    assert heard([*CALM, 0.25, 0.24, 0.25]).since_ns == len(CALM) * TENTH
+    assert heard([*CALM, 0.31, 0.25, 0.24]).since_ns == len(CALM) * TENTH
+    assert heard([0.24] * 11).since_ns is None
+
+
+def test_the_search_ends_and_is_opened_by_new_responses_only():
+    opened = heard([*CALM, 0.25, 0.24, 0.25])
+    still = heard([0.25] * 10, opened, begin=11)
+    assert still.since_ns == opened.since_ns
+    over = heard([0.25] * 12, still, begin=len(CALM) + 21)
+    assert over.since_ns is None
+    assert heard([*CALM, *CALM, 0.2, 0.2, 0.2], over, begin=60).since_ns == 75 * TENTH

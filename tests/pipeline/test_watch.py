@@ -343,7 +343,7 @@ def test_stages_are_measured_by_the_caller():
         watch.step(pair, stage)
     assert begun == ended
     assert begun[:4] == ["motion", "ground", "edges", "gradients"]
-    assert begun[-1] == "judgement"
+    assert "judgement" in begun
 
 
 def test_up_and_forward_are_those_of_the_vehicle_else_of_the_camera():

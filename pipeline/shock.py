@@ -71,7 +71,8 @@ class Shock:
 
     Attributes:
         xi: float64 (6,), of the mount's estimate after against before.
-        covariance: float64 (6,6), of its random error; nothing else is left in a difference.
+        covariance: float64 (6,6), of its random error, and of what a step of one sigma in the time between
+            sweep and image would feign; nothing else is left in a difference.
         statistic: Squared step in sigmas, chi-square of six degrees without one.
         lost: Share of its score that each side at least loses under the extrinsic of the other.
         preference: Standard errors by which the cells of each side at least prefer its own.
@@ -123,6 +124,7 @@ def find_shock(
     alertness: Alertness,
     camera: CameraModel,
     T_expected: Floats,
+    B: Floats,
     settings: EdgeWitnessParameters,
     parameters: ShockParameters,
 ) -> Shock | None:
@@ -133,6 +135,7 @@ def find_shock(
         alertness: With the moment of the step.
         camera: Intrinsics.
         T_expected: float64 (4,4), the extrinsic that ``alertness.xi`` is against.
+        B: float64 (6,6), turns xi into vehicle axes (``se3.vehicle_block``).
         settings: Of the edge witness.
         parameters: See there.
     """
@@ -154,6 +157,8 @@ def find_shock(
     _, (step, _) = edge_search.find_maxima(new, T_old, score(new, T_old, 0), settings, None, None)
     T_new = se3.retract(T_old, step)
     covariance = _mean_covariance(old, T_old, settings) + _mean_covariance(new, T_new, settings)
+    feigned = B.T @ np.mean([frame.feigned for frame in after], axis=0)
+    covariance = covariance + np.outer(feigned, feigned)
     sides = ((old, T_old, T_new), (new, T_new, T_old))
     own, other = zip(*((score_only(b, T, 0), score_only(b, T_off, 0)) for b, T, T_off in sides), strict=True)
     return Shock(

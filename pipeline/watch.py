@@ -327,11 +327,13 @@ class Watch:
         settings, budget = self.parameters.shock, self.parameters.scenes.budget
         if belief.edges is None:
             return None
+        B = se3.vehicle_block(self.mount.R_vehicle_cam)
         found = shock.find_shock(
             tuple(self._edge_frames),
             self._alertness,
             self.mount.camera,
             belief.edges.trail.T_stored,
+            B,
             self.parameters.edge_witness,
             settings,
         )
@@ -339,7 +341,6 @@ class Watch:
         self._alertness = dataclasses.replace(self._alertness, found=self._alertness.found + 1 if told else 0)
         if found is None or self._alertness.found < settings.confirmations:
             return None
-        B = se3.vehicle_block(self.mount.R_vehicle_cam)
         return verdict.Steady(
             alarming=True,
             suspicious=True,

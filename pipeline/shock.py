@@ -5,6 +5,7 @@ common to both and falls out of their difference, so that a small step shows wit
 stands out from the floor between scenes.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Sequence
@@ -55,12 +56,14 @@ class Alertness:
     Attributes:
         responses: Stamp and mean response of frames under what is believed, oldest first.
         since_ns: Stamp of the first frame that may come after a step, or None.
+        after: Frames since then.
         xi: float64 (6,), what was believed when that was suspected, against the expected extrinsic.
         found: Judgements in a row that found a step.
     """
 
     responses: tuple[tuple[int, float], ...] = ()
     since_ns: int | None = None
+    after: int = 0
     xi: Floats | None = None
     found: int = 0
 
@@ -103,7 +106,7 @@ def heeded(
     """
     if alertness.since_ns is not None:
         if stamp_ns - alertness.since_ns <= parameters.open_ns:
-            return alertness
+            return dataclasses.replace(alertness, after=alertness.after + 1)
         # What is believed has changed since then, and with it what a response is compared with.
         alertness = Alertness()
     count = parameters.before + parameters.newest
@@ -115,7 +118,7 @@ def heeded(
     error = float(before.std(ddof=1)) * math.sqrt(1.0 / len(before) + 1.0 / len(newest))
     # The median: a frame that is dazzled, or behind a wiper, does not speak for those beside it.
     if float(np.median(newest)) < before.mean() - parameters.fall * error:
-        return Alertness(responses, responses[parameters.before][0], xi)
+        return Alertness(responses, responses[parameters.before][0], parameters.newest, xi)
     return Alertness(responses)
 
 
@@ -185,6 +188,18 @@ def _mean_covariance(batch: EdgeBatch, T_cam_lidar: Floats, settings: EdgeWitnes
     pulls = np.stack([np.bincount(batch.slot, column, len(weights)) for column in (share * UNITS).T])
     moves = UNITS[:, None] * (edge_witness.inverse_curvature(H, settings) @ pulls)
     return np.asarray(edge_witness.sandwich(batch, H, share, settings) + moves @ moves.T, dtype=np.float64)
+
+
+def weighed(
+    alertness: Alertness, shock: Shock | None, budget: AlarmBudget, parameters: ShockParameters
+) -> Alertness:
+    """The alertness after a judgement that looked for a step: a step far from any belief is let go."""
+    if shock is None:
+        return alertness
+    if shock.statistic < 0.5 * _level(budget):
+        return Alertness()
+    found = alertness.found + 1 if believed(shock, budget, parameters) else 0
+    return dataclasses.replace(alertness, found=found)
 
 
 def believed(shock: Shock, budget: AlarmBudget, parameters: ShockParameters) -> bool:

@@ -3,7 +3,6 @@
 Pure: no files, no clock. What a stage costs is measured by the caller through ``stage``.
 """
 
-import dataclasses
 from collections import Counter, deque
 from dataclasses import dataclass
 
@@ -254,7 +253,10 @@ class Watch:
     def _judged(self, findings: Findings, now_ns: int, stage: Stage) -> Findings:
         assert self.memory is not None  # noqa: S101 - set on entry
         beginning = now_ns - self._begun_ns < self.parameters.window.beginning_ns
-        stirred = self.memory.state in ("suspect", "drifted") or self._alertness.since_ns is not None
+        stirred = (
+            self.memory.state in ("suspect", "drifted")
+            or self._alertness.after >= self.parameters.shock.least_frames
+        )
         stirred = stirred and self.memory.severity is None
         frames = max(len(self._edge_frames), len(self._line_frames))
         due = window.judgement_due(
@@ -337,8 +339,7 @@ class Watch:
             self.parameters.edge_witness,
             settings,
         )
-        told = found is not None and shock.believed(found, budget, settings)
-        self._alertness = dataclasses.replace(self._alertness, found=self._alertness.found + 1 if told else 0)
+        self._alertness = shock.weighed(self._alertness, found, budget, settings)
         if found is None or self._alertness.found < settings.confirmations:
             return None
         return verdict.Steady(

@@ -11,7 +11,7 @@ from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair
 from pipeline.run_length import AlarmBudget
-from pipeline.shock import Alertness, ShockParameters, believed, find_shock, heeded
+from pipeline.shock import Alertness, ShockParameters, believed, find_shock, heeded, weighed
 from pipeline.watch import Watch
 
 P = ShockParameters()
@@ -49,7 +49,7 @@ def moved(frames, mount, step, first):
 
 
 def found(frames, mount, step, first=5):
-    alertness = Alertness((), frames[first].stamp_ns, ZERO)
+    alertness = Alertness((), frames[first].stamp_ns, 5, ZERO)
     B = se3.vehicle_block(mount.R_vehicle_cam)
     args = mount.camera, mount.T_cam_lidar, B, EdgeWitnessParameters(), P
     return find_shock(moved(frames, mount, step, first), alertness, *args)
@@ -113,6 +113,18 @@ def test_each_doubt_alone_is_enough_not_to_believe_it(change):
     assert stats.chi2.sf(46.0, 6) * BUDGET.yearly_scenes < BUDGET.yearly_alarms
     assert believed(sure, BUDGET, P)
     assert not believed(dataclasses.replace(sure, **change), BUDGET, P)
+
+
+def test_a_step_is_sought_until_it_is_far_from_any_belief():
+    opened = Alertness((), 1, 5, ZERO)
+    sure = shock.Shock(ZERO, np.eye(6), statistic=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1)
+    assert weighed(opened, None, BUDGET, P) is opened
+    once = weighed(opened, sure, BUDGET, P)
+    assert (once.found, once.since_ns) == (1, 1)
+    assert weighed(once, sure, BUDGET, P).found == 2
+    near = weighed(once, dataclasses.replace(sure, statistic=40.0), BUDGET, P)
+    assert (near.found, near.since_ns) == (0, 1)
+    assert weighed(once, dataclasses.replace(sure, statistic=20.0), BUDGET, P).since_ns is None
 
 
 def heard(responses, alertness=None, begin=0):

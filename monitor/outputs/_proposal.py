@@ -43,7 +43,7 @@ def _sentence(document: CandidateDocument, name: str) -> str:
 
 
 def _axes(document: CandidateDocument) -> list[tuple[str, str]]:
-    rows = []
+    rows: list[tuple[str, str]] = []
     for name in AXIS_NAMES:
         value, sigma = getattr(document.drift, name), getattr(document.sigma, name)
         rows.append((name, f"{size_text(name, value, sign=True)} ± {size_text(name, sigma)}"))

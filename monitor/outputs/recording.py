@@ -10,13 +10,15 @@ listens on the network, and the part of rerun that writes files sends no analyti
 import threading
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
-from monitor.events import EndEvent, Event, FrameEvent, ProposalEvent
+from monitor.events import EndEvent, Event, FrameEvent, ProposalEvent, StatusEvent
 from monitor.outputs import OutputKind, folder_of, rename_whole
 
 if TYPE_CHECKING:  # half a second and 500 MB of library that commands without a recording do without
     from monitor.outputs._rerun_log import RerunLog
+
+_Recorded: TypeAlias = FrameEvent | StatusEvent | EndEvent
 
 FILE_NAME = "recording.rrd"
 PARTIAL_NAME = "recording.partial.rrd"
@@ -52,7 +54,7 @@ class Recording:
         self._partial = folder / PARTIAL_NAME
         self._period_ns = _SAME_RATE * 1e9 / images_hz
         self._kept_ns: dict[str, int] = {}
-        self._queue: deque[Event] = deque()
+        self._queue: deque[_Recorded] = deque()
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._ended = False
@@ -81,7 +83,7 @@ class Recording:
         if isinstance(event, EndEvent):
             self._end(event)
         elif isinstance(event, ProposalEvent):
-            return
+            return  # a file of its own, and no entity of the recording
         elif self._lost is None and not (isinstance(event, FrameEvent) and self._too_soon(event)):
             with self._changed:
                 self._make_room(
@@ -108,7 +110,7 @@ class Recording:
         self._kept_ns[frame.pair] = frame.stamp_ns
         return False
 
-    def _make_room(self, kind: type[Event], most: int) -> None:
+    def _make_room(self, kind: type[_Recorded], most: int) -> None:
         """Drops the oldest event of a kind where the queue holds as many as it may."""
         places = [place for place, event in enumerate(self._queue) if isinstance(event, kind)]
         if len(places) >= most:
@@ -162,7 +164,7 @@ class Recording:
             except Exception as error:  # noqa: BLE001 # top of a thread: reports and lets the rest go
                 self._lose(f"{type(error).__name__}: {error}")
 
-    def _put(self, event: Event) -> None:
+    def _put(self, event: _Recorded) -> None:
         if isinstance(event, FrameEvent):
             self._log.frame(event)
         elif isinstance(event, EndEvent):

@@ -84,15 +84,15 @@ def street_scenes(seed: int, index: int) -> list[Scene]:
                 parameters.lidar.period,
             )
         )
-        heard = watch.belief
-        if heard is not None and watch.scenes.scenes > len(found) and watch.scenes.way_m is not None:
+        heard, total = watch.belief, watch.scenes.total
+        if heard is not None and total.scenes > len(found) and total.way_m is not None:
             evidence = heard.evidence
             found.append(
                 Scene(
                     evidence.drift,
                     evidence.covariance,
                     evidence.feigned,
-                    watch.scenes.way_m,
+                    total.way_m,
                     frame.image_stamp_ns,
                 )
             )

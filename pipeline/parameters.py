@@ -8,6 +8,7 @@ from pipeline.edge_witness import EdgeWitnessParameters
 from pipeline.edges import EdgeParameters
 from pipeline.masks import MaskParameters
 from pipeline.scene_sum import SceneSumParameters
+from pipeline.scene_track import TrackParameters
 from pipeline.shock import ShockParameters
 from pipeline.traces import TraceParameters
 from pipeline.verdict import VerdictParameters
@@ -28,6 +29,7 @@ class Parameters:
         test: Thresholds of the drift test.
         scenes: How all scenes of a drive are summed, and how often a false alarm may come.
         causes: How a moved mount is told from clocks and lens.
+        track: How fast a wandering mount is followed over scenes.
         shock: When a sudden move is looked for, and when it is believed.
         verdict: Hysteresis and patience.
         traces: How much of the past is kept to tell when a drift began.
@@ -42,6 +44,7 @@ class Parameters:
     test: DriftTestParameters = field(default_factory=DriftTestParameters)
     scenes: SceneSumParameters = field(default_factory=SceneSumParameters)
     causes: CauseParameters = field(default_factory=CauseParameters)
+    track: TrackParameters = field(default_factory=TrackParameters)
     shock: ShockParameters = field(default_factory=ShockParameters)
     verdict: VerdictParameters = field(default_factory=VerdictParameters)
     traces: TraceParameters = field(default_factory=TraceParameters)

@@ -8,26 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import scene_sum, se3, shock, verdict, window
+from pipeline import verdict, window
 from pipeline.belief import Belief, believe
 from pipeline.candidate import Proposal, Proposer, moved_since
 from pipeline.dating import Dating
 from pipeline.drift_test import Expectation
-from pipeline.edge_score import batch_of, mean_responses
+from pipeline.drive_scenes import DriveScenes
 from pipeline.edge_witness import EdgeFrame
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, edge_frame, unmeasured
 from pipeline.inquiry import Inquiry
 from pipeline.line_witness import LineFrame
 from pipeline.mount import Mount
-from pipeline.onset import Onset
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
-from pipeline.scene_filter import Scene
 from pipeline.segmentation import Segmenter
-from pipeline.shock import Alertness
-
-_SCENE_STAMPS = 1024
-"""Scenes whose stamps are kept: 20 km; a drift that began before is told to have begun before the data."""
+from pipeline.step_seeker import StepSeeker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,10 +86,8 @@ class Watch:
         self._dating = Dating(mount.camera, parameters.traces)
         self._proposer = Proposer(mount, parameters)
         self.inquiry = Inquiry(mount, parameters)
-        self.scenes = scene_sum.begin(mount.expectation(parameters.test))
-        self._alertness = Alertness()
-        self._scene_stamps: deque[int] = deque(maxlen=_SCENE_STAMPS)
-        self._begun_m: float | None = None
+        self.scenes = DriveScenes(mount, parameters)
+        self._seeker = StepSeeker(mount, parameters)
         self._begun_ns = 0
         self._judged_ns: int | None = None
         self.departed: Counter[window.Departure] = Counter()
@@ -181,9 +174,7 @@ class Watch:
         self.memory = verdict.acknowledge(self.memory, now_ns, by, why)
         self._forget()
         self._dating = Dating(self.mount.camera, self.parameters.traces)
-        self.scenes = scene_sum.begin(self._expectation())
-        self._scene_stamps.clear()
-        self._begun_m = None
+        self.scenes.forget()
         self.inquiry.forget()
         self._begun_ns = now_ns
         return True
@@ -210,7 +201,7 @@ class Watch:
         self._scout.forget()
         self.breaks += 1
         self._proposer.forget()
-        self._alertness = Alertness()
+        self._seeker.forget()
         self._judged_ns = None
 
     def _looked_at(self, pair: FramePair, stage: Stage, foresight: Foresight | None) -> Findings:
@@ -224,7 +215,7 @@ class Watch:
             frame = edge_frame(pair, evidence.edges, evidence.straight, self.mount, stage)
             self._edge_frames.append(frame)
             self._dating.see(frame)
-            self._heed(frame)
+            self._seeker.see(frame, self.belief)
             self.inquiry.see(now_ns, evidence.straight)
         if evidence.lines is not None:
             self._line_frames.append((now_ns, evidence.lines))
@@ -253,10 +244,7 @@ class Watch:
     def _judged(self, findings: Findings, now_ns: int, stage: Stage) -> Findings:
         assert self.memory is not None  # noqa: S101 - set on entry
         beginning = now_ns - self._begun_ns < self.parameters.window.beginning_ns
-        stirred = (
-            self.memory.state in ("suspect", "drifted")
-            or self._alertness.after >= self.parameters.shock.least_frames
-        )
+        stirred = self.memory.state in ("suspect", "drifted") or self._seeker.due
         stirred = stirred and self.memory.severity is None
         frames = max(len(self._edge_frames), len(self._line_frames))
         due = window.judgement_due(
@@ -274,9 +262,9 @@ class Watch:
         self._judged_ns = now_ns
         if self.belief is None:
             return findings
-        self._sum_scene(self.belief, now_ns)
+        self.scenes.hear(self.belief, self.window_way_m, now_ns)
         with stage("shock"):
-            steady = self._shock(self.belief, now_ns) or self._steady()
+            steady = self._seeker.said(self.edge_frames, self.belief, now_ns) or self.scenes.said()
         with stage("inquiry"):
             doubt = self.inquiry.ask(tuple(self._edge_frames), self.belief, self.memory, steady)
         self.memory = verdict.advance(
@@ -296,75 +284,6 @@ class Watch:
             self._propose(now_ns)
         return Findings(
             None, findings.cloud, findings.edge_points, findings.masks, findings.lines, judged=True
-        )
-
-    def _sum_scene(self, belief: Belief, now_ns: int) -> None:
-        """Adds the window to the sum over scenes, once it shares no frame with the last that was added."""
-        oldest_m, newest_m = self.window_way_m
-        if self._begun_m is None:
-            self._begun_m = oldest_m
-        seen = belief.edges is not None and not belief.judgement.blind and not belief.judgement.contradicted
-        whole = newest_m - self._begun_m >= scene_sum.NEW_SCENE_M
-        if not (seen and whole and scene_sum.is_new(self.scenes, oldest_m, newest_m)):
-            return
-        evidence = belief.evidence
-        scene = Scene(evidence.drift, evidence.covariance, evidence.feigned, newest_m, now_ns)
-        expectation = self.mount.expectation(self.parameters.test)
-        self.scenes = scene_sum.advance(self.scenes, scene, expectation, self.parameters.scenes)
-        self._scene_stamps.append(now_ns)
-
-    def _heed(self, frame: EdgeFrame) -> None:
-        """Notes how well a new frame fits what is believed."""
-        if self.belief is None or self.belief.edges is None or self.belief.judgement.blind:
-            self._alertness = Alertness()
-            return
-        batch = batch_of([frame], self.mount.camera, self.parameters.edge_witness.most_edges)
-        response = float(mean_responses(batch, [self.belief.T_estimated])[0, 0])
-        self._alertness = shock.heeded(
-            self._alertness, frame.stamp_ns, response, self.belief.edges.xi, self.parameters.shock
-        )
-
-    def _shock(self, belief: Belief, now_ns: int) -> verdict.Steady | None:
-        """What the newest frames say of a sudden move, once enough judgements in a row found it."""
-        settings, budget = self.parameters.shock, self.parameters.scenes.budget
-        if belief.edges is None:
-            return None
-        B = se3.vehicle_block(self.mount.R_vehicle_cam)
-        found = shock.find_shock(
-            tuple(self._edge_frames),
-            self._alertness,
-            self.mount.camera,
-            belief.edges.trail.T_stored,
-            B,
-            self.parameters.edge_witness,
-            settings,
-        )
-        self._alertness = shock.weighed(self._alertness, found, budget, settings)
-        if found is None or self._alertness.found < settings.confirmations:
-            return None
-        return verdict.Steady(
-            alarming=True,
-            suspicious=True,
-            drift=B @ found.xi,
-            sigma=np.sqrt(np.diag(B @ found.covariance @ B.T)),
-            over=f"the last {(now_ns - found.since_ns) / 1e9:.1f} s",
-            onset=Onset(found.since_ns, found.before_ns, found.since_ns),
-        )
-
-    def _steady(self) -> verdict.Steady | None:
-        """What all scenes so far say."""
-        total, settings = self.scenes, self.parameters.scenes
-        since_ns = total.since_ns
-        if since_ns is None:
-            return None
-        before_ns = max((stamp for stamp in self._scene_stamps if stamp < since_ns), default=self._begun_ns)
-        return verdict.Steady(
-            alarming=scene_sum.alarming(total, settings),
-            suspicious=scene_sum.suspicious(total, settings),
-            drift=total.moved,
-            sigma=np.sqrt(np.diag(total.moved_covariance)),
-            over=f"{total.scenes} scenes" if total.scenes > 1 else "one scene",
-            onset=Onset(since_ns, before_ns, since_ns),
         )
 
     def _propose(self, now_ns: int, *, ended: bool = False) -> None:
@@ -388,4 +307,4 @@ class Watch:
         edges = None if self.belief is None or self._judged_ns is None else self.belief.edges
         trail = None if edges is None else edges.trail
         frames = tuple(self._edge_frames)
-        return believe(self.mount, self.parameters, frames, lines, self.scenes.scenes, trail)
+        return believe(self.mount, self.parameters, frames, lines, self.scenes.total.scenes, trail)

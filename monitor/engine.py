@@ -196,6 +196,7 @@ class Engine:
                 timing={name: _quantiles(values) for name, values in self._timing.items()},
                 outputs_lost=self._outputs_lost(),
                 explanation=self.watch.inquiry.explanation,
+                track=self.watch.scenes.track,
                 left=self.watch.departed,
             ),
             self._seq,

@@ -13,6 +13,7 @@ from monitor.status import (
     AxisValues,
     Consequence,
     Drift,
+    Drive,
     Frames,
     Onset,
     Provenance,
@@ -32,6 +33,7 @@ from pipeline.consequence import consequences
 from pipeline.fusion import Testimony
 from pipeline.mount import Mount
 from pipeline.records import Floats
+from pipeline.scene_track import SceneTrack
 from pipeline.window import Departure
 
 TO_PEOPLE = np.array([180.0 / math.pi] * 3 + [1.0] * 3)
@@ -71,6 +73,7 @@ class Measured:
         timing: Stage -> quantiles.
         outputs_lost: Output -> what happened.
         explanation: What the drive says of mount, clock and lens, or None.
+        track: Where the mount is by all scenes of the drive, or None.
         left: Reason -> frames that left the window.
     """
 
@@ -83,6 +86,7 @@ class Measured:
     timing: Mapping[str, Timing]
     outputs_lost: Mapping[str, str]
     explanation: Explanation | None = None
+    track: SceneTrack | None = None
     left: Mapping[Departure, int] = field(default_factory=dict)
 
 
@@ -114,6 +118,7 @@ def status_of(
         drift=_drift(mount, memory, belief),
         consequence=_consequence(mount, belief),
         witnesses=_witnesses(belief),
+        drive=_drive(measured.track),
         window=Window(
             frames=len(stamps),
             span_s=(stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0,
@@ -209,6 +214,13 @@ def _witness(testimony: Testimony, frames: int, chi2: float | None) -> Witness:
         chi2=None if chi2 is None else finite(chi2),
         frames=frames,
     )
+
+
+def _drive(track: SceneTrack | None) -> Drive | None:
+    if track is None or track.scenes == 0:
+        return None
+    sigma = np.sqrt(np.diag(track.drift_covariance))
+    return Drive(scenes=track.scenes, drift=_values(track.drift), sigma=_values(sigma))
 
 
 def _values(six: Floats) -> AxisValues:

@@ -184,6 +184,14 @@ class Witnesses(_Part):
     edges: Witness | None
 
 
+class Drive(_Part):
+    """Where the mount is by all scenes of the drive, a wandering one followed."""
+
+    scenes: NonNegativeInt = Field(description="stretches of road that share no frame, heard so far")
+    drift: AxisValues
+    sigma: AxisValues = Field(description="standard deviation, what scenes differ by included")
+
+
 class Window(_Part):
     """Evidence on which the present verdict rests."""
 
@@ -259,6 +267,7 @@ class Status(_Part):
         default=(), description="what the drift does at several distances; none while nothing is known"
     )
     witnesses: Witnesses
+    drive: Drive | None = Field(default=None, description="null before the first scene of a drive")
     window: Window
     frames: Frames
     rates: Rates

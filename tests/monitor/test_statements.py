@@ -9,12 +9,14 @@ import pytest
 
 from monitor.statements import Identity, Measured, status_of
 from monitor.status import AXIS_NAMES, Provenance, Rates
-from pipeline import fusion, verdict
+from pipeline import fusion, scene_track, verdict
 from pipeline.belief import Belief
 from pipeline.causes import Explanation
-from pipeline.drift_test import Evidence, Judgement
+from pipeline.drift_test import DriftTestParameters, Evidence, Judgement, expectation_of_stored
 from pipeline.mount import Mount
 from pipeline.records import CameraModel
+from pipeline.scene_filter import Scene
+from pipeline.scene_track import TrackParameters
 
 NONE = Provenance(hash=None, version=None)
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.2, 0.15, 0.15])
@@ -30,7 +32,7 @@ MOUNT = Mount(
 )
 
 
-def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None):
+def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None, track=None):
     rates = Rates(lidar_hz=None, camera_hz=None, gap_ms=None)
     measured = Measured(
         received=7,
@@ -42,6 +44,7 @@ def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None):
         timing={},
         outputs_lost={"report": "the disk is full"},
         explanation=explanation,
+        track=track,
     )
     identity = Identity("van-1", "front", NONE, NONE, "calibwatch test")
     return status_of(identity, mount, verdict.start(5), belief, measured, 3, 9)
@@ -140,3 +143,17 @@ def test_a_time_offset_is_told_where_it_is_no_drift():
     hidden = said(explanation=dataclasses.replace(explanation, separable=False)).time_offset
     assert hidden.model_dump() == pytest.approx({"ms": None, "sigma_ms": 2.0, "separable": False})
     assert said().time_offset.sigma_ms is None
+
+
+def test_where_the_mount_is_by_all_scenes_is_told_from_the_first_on():
+    expectation = expectation_of_stored(math.radians(0.1), 0.02, DriftTestParameters())
+    track = scene_track.begin(expectation)
+    assert said(track=track).drive is None
+    drift = np.array([0.0, 0.0, math.radians(0.2), 0.0, 0.0, -0.03])
+    scene = Scene(drift, np.diag([1e-8] * 3 + [1e-6] * 3), np.zeros(6), 20.0, 1)
+    track = scene_track.followed(track, scene, expectation, TrackParameters(most_square=1e9))
+    told = said(track=track).drive
+    assert told.scenes == 1
+    assert 0.0 < told.drift.yaw < 0.2
+    assert -0.03 < told.drift.up < 0.0
+    assert told.sigma.yaw == pytest.approx(math.degrees(math.sqrt(track.drift_covariance[2, 2])))

@@ -60,6 +60,7 @@ STATUS = {
         }
     ],
     "witnesses": {"lines": {"drift": VALUES, "sigma": VALUES, "chi2": 1.0, "frames": 3}, "edges": None},
+    "drive": {"scenes": 4, "drift": VALUES, "sigma": VALUES},
     "window": {
         "frames": 3,
         "span_s": 1.0,

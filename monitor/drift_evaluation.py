@@ -127,6 +127,7 @@ def _row(
         code=memory.code,
         frames=len(drive.frames),
         span_s=drive.span_s,
+        since_s=_since_s(drive, trial),
         suspected_s=_first(states, ("suspect", "drifted")),
         told_s=_first(states, ("drifted",)),
         told_frames=None if told is None else told + 1,
@@ -135,6 +136,11 @@ def _row(
         reference_sigma=_six(drive.reference_sigma * TO_PEOPLE),
         seconds=seconds,
     )
+
+
+def _since_s(drive: KnownDrive, trial: Trial) -> float:
+    first = drive.frames[trial.first_wrong(len(drive.frames))]
+    return (first.image_stamp_ns - drive.frames[0].image_stamp_ns) / 1e9
 
 
 def _first(states: Sequence[tuple[State, float]], wanted: tuple[State, ...]) -> float | None:

@@ -64,6 +64,8 @@ class Row(_Values):
     code: str
     frames: int
     span_s: float
+    since_s: float = 0.0
+    """s of data from the first image to the first in which anything is wrong."""
     suspected_s: float | None
     """s of data from the first image to the first that was followed by 'suspect' or 'drifted'."""
     told_s: float | None

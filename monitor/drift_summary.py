@@ -93,11 +93,11 @@ class Cell(_Values):
     """At the end."""
     codes: dict[str, int]
     told: Share
-    """Share that was told 'drifted' at any time."""
+    """Share that was told 'drifted' at any time from when on anything was wrong."""
     noticed: int
     """Runs that were ever 'suspect' or 'drifted'."""
     delay_s: float | None
-    """Data until told, median."""
+    """Data from then until told, median."""
     statistic: float | None
     """Median of T."""
 
@@ -243,7 +243,8 @@ def _cells(group: str, rows: Sequence[Row]) -> list[Cell]:
 
 
 def _cell(group: str, kind: Kind, label: str, rows: Sequence[Row]) -> Cell:
-    delay = _middle_and_end(row.told_s for row in rows)
+    delays = [_delay(row) for row in rows]
+    delay = _middle_and_end(delays)
     judged = [row.said.statistic for row in rows if row.said is not None]
     return Cell(
         group=group,
@@ -252,11 +253,18 @@ def _cell(group: str, kind: Kind, label: str, rows: Sequence[Row]) -> Cell:
         runs=len(rows),
         states=dict(Counter(row.state for row in rows)),
         codes=dict(Counter(row.code for row in rows)),
-        told=share(sum(row.told_s is not None for row in rows), len(rows)),
+        told=share(sum(one is not None for one in delays), len(rows)),
         noticed=sum(row.suspected_s is not None for row in rows),
         delay_s=None if delay is None else delay[0],
         statistic=float(np.median(judged)) if judged else None,
     )
+
+
+def _delay(row: Row) -> float | None:
+    """Data from when on anything was wrong until it was told; what was told before that is a false alarm."""
+    if row.told_s is None or row.told_s < row.since_s:
+        return None
+    return row.told_s - row.since_s
 
 
 def _smallest(group: str, rows: Sequence[Row]) -> list[Smallest]:

@@ -29,6 +29,7 @@ Kind: TypeAlias = Literal[
     "time-offset",
     "focal",
     "offline",
+    "slip",
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -47,6 +48,10 @@ COMBINED_M = (0.1, 0.2)
 
 RAMP_DEG = (0.25, 0.5, 1.0)
 """Turn that has grown evenly by the end of the drive."""
+
+SLIP_DEG = (0.1, 0.25, 0.5)
+SLIP_M = (0.05, 0.10, 0.20)
+"""Steps along one axis of a mount that held until half of the drive."""
 
 SHAKE_DEG = (0.1, 0.2, 0.4)
 """Root mean square angle of a camera that shakes faster than frames follow each other."""
@@ -82,7 +87,8 @@ class Trial:
         number: Among the trials of this kind.
         drift: float64 (6,), vehicle axes, rad and m: motion of the mount since the extrinsic was
             stored, at the end of the drive.
-        ramp: Whether the drift grows evenly over the drive; else it is there from the first frame.
+        ramp: Whether the drift grows evenly over the drive.
+        slips: Whether it comes at once, at half of the drive; with neither it is there from the first frame.
         shake_rad: Root mean square angle by which the camera shakes, rad.
         late_ns: Images bear stamps that are later by so much, ns.
         focal: The stored focal length is so many times the true one.
@@ -93,12 +99,28 @@ class Trial:
     number: int
     drift: Floats
     ramp: bool = False
+    slips: bool = False
     shake_rad: float = 0.0
     late_ns: int = 0
     focal: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "drift", read_only(self.drift))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the mount moves during the drive."""
+        return self.ramp or self.slips
+
+    def share(self, frame: int, frames: int) -> float:
+        """How much of the drift is there at a frame, of so many."""
+        if self.ramp:
+            return frame / max(frames - 1, 1)
+        return float(frame >= self.first_wrong(frames))
+
+    def first_wrong(self, frames: int) -> int:
+        """The first frame, of so many, in which anything is wrong."""
+        return frames // 2 if self.slips else 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +178,7 @@ def stage(trial: Trial, true: Mount, frames: Sequence[FramePair], rng: np.random
     left, top, right, bottom = (int(n) for n in rng.integers(0, CROPPED_PX + 1, 4))
     turns = shaking(trial.shake_rad, len(frames), rng)
     stored = true.T_cam_lidar
-    if not trial.ramp:
+    if not trial.moves:
         T = true.T_vehicle_lidar
         stored = se3.stored_before(stored, trial.drift, None if T is None else T[:3, :3])
     mount = dataclasses.replace(
@@ -173,9 +195,9 @@ def stage(trial: Trial, true: Mount, frames: Sequence[FramePair], rng: np.random
                 pixels = turned_image(pixels, true.camera, turns[k])
             height, width = pixels.shape[:2]
             moved = G
-            if trial.ramp:
-                share = k / max(len(frames) - 1, 1)
-                T_now = se3.displaced(true.T_cam_lidar, share * trial.drift, true.R_vehicle_cam)
+            if trial.moves:
+                xi = trial.share(k, len(frames)) * trial.drift
+                T_now = se3.displaced(true.T_cam_lidar, xi, true.R_vehicle_cam)
                 moved = G @ se3.inverse(T_now) @ true.T_cam_lidar
             yield dataclasses.replace(
                 pair,
@@ -339,6 +361,22 @@ def _ramps() -> dict[str, _Draw]:
     return {f"{amount:g} deg by the end": ramp(amount) for amount in RAMP_DEG}
 
 
+def _slips() -> dict[str, _Draw]:
+    def slip(axis: int, amount: float) -> _Draw:
+        def give(true: Mount, rng: np.random.Generator) -> dict[str, object]:
+            del true
+            return {"drift": rng.choice((-1.0, 1.0)) * amount * np.eye(6)[axis], "slips": True}
+
+        return give
+
+    return {
+        f"{name} {amount:g} {unit}": slip(axis, math.radians(amount) if axis < 3 else amount)
+        for axis, name in enumerate(AXES)
+        for unit, amounts in (("deg", SLIP_DEG) if axis < 3 else ("m", SLIP_M),)
+        for amount in amounts
+    }
+
+
 def _offline() -> dict[str, _Draw]:
     def wrong(axis: int, turn_deg: float, shift_m: float) -> _Draw:
         def give(true: Mount, rng: np.random.Generator) -> dict[str, object]:
@@ -373,5 +411,6 @@ _CELLS: Mapping[Kind, Mapping[str, _Draw]] = {
         for sign in (1, -1)
     },
     "offline": _offline(),
+    "slip": _slips(),
 }
 """Label -> what it draws, of each kind."""

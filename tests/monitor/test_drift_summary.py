@@ -94,6 +94,21 @@ def test_the_smallest_drift_is_that_from_which_on_all_are_told():
     assert found["up"].shares == {}
 
 
+def test_a_slip_is_told_from_when_on_it_was_there():
+    given = {"kind": "slip", "label": "yaw 0.25 deg", "since_s": 1.0, "state": "drifted"}
+    rows = [
+        row(0, **given, suspected_s=1.2, told_s=1.4),
+        row(1, **given, suspected_s=1.0, told_s=1.0),
+        row(2, **given, suspected_s=0.9, told_s=0.9),
+        row(3, **(given | {"state": "suspect"}), suspected_s=1.5),
+    ]
+    found = summary_of(HEADER, rows)
+    (cell,) = found.cells
+    assert (cell.told.hits, cell.told.of, cell.noticed) == (2, 4, 4)
+    assert cell.delay_s == pytest.approx(0.2)
+    assert "| a | yaw 0.25 deg | 4 | 2/4 | 3 drifted, 1 suspect | 0.2 | 3 |" in drift_text(found)
+
+
 def test_errors_fall_into_the_cells_of_the_stanford_diagram():
     """Reference of 0.2 deg and 5 cm is allowed; alert limits are 0.5 deg and 0.1 m."""
     cases = {
@@ -120,7 +135,7 @@ def test_errors_fall_into_the_cells_of_the_stanford_diagram():
     assert found.within_two == pytest.approx(2 / 5)
 
 
-@pytest.mark.parametrize("kind", ["ramp", "vibration", "time-offset", "focal"])
+@pytest.mark.parametrize("kind", ["ramp", "vibration", "time-offset", "focal", "slip"])
 def test_estimates_are_not_held_against_a_truth_that_did_not_hold(kind):
     assert stanford_points(row(0, kind=kind)) == []
 

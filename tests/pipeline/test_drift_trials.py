@@ -170,6 +170,29 @@ def test_a_ramp_grows_evenly():
         assert drift_between(told, now) == pytest.approx(k / 4 * drift, abs=1e-4)
 
 
+@pytest.mark.parametrize(("count", "first"), [(5, 2), (6, 3)])
+def test_a_mount_that_slips_moves_at_once_at_half_of_the_drive(count, first):
+    true, drive = mount(), frames(count)
+    slip = trial(np.array([0.0, 0.01, 0.0, 0.0, 0.0, -0.1]), slips=True)
+    assert slip.first_wrong(count) == first
+    told, out = staged(slip, true, drive)
+    for k, (before, after) in enumerate(zip(drive, out, strict=True)):
+        now = aligned(after.cloud.xyz.astype(float), se3.apply(true.T_cam_lidar, before.cloud.xyz))
+        assert drift_between(told, now) == pytest.approx((k >= first) * slip.drift, abs=2e-4)
+
+
+def test_slips_are_along_one_axis_by_what_their_label_says():
+    signs = set()
+    for number, label in enumerate(drift_trials.labels_of("slip")):
+        drift = drift_trials.draw("slip", number, mount(), np.random.default_rng(number)).drift
+        axis, amount, unit = label.split()
+        size = math.radians(float(amount)) if unit == "deg" else float(amount)
+        expected = size * np.eye(6)[AXES.index(axis)]
+        assert np.abs(drift) == pytest.approx(expected, abs=1e-12)
+        signs.add(float(np.sign(drift.sum())))
+    assert signs == {-1.0, 1.0}
+
+
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["pinhole", "lens"])
 def test_a_turned_camera_sees_things_where_they_project(camera):
     """Blobs painted at the pixels of some rays are found at the pixels of the turned rays."""

@@ -117,8 +117,10 @@ def heeded(
     before, newest = values[: parameters.before], values[parameters.before :]
     error = float(before.std(ddof=1)) * math.sqrt(1.0 / len(before) + 1.0 / len(newest))
     # The median: a frame that is dazzled, or behind a wiper, does not speak for those beside it.
-    if float(np.median(newest)) < before.mean() - parameters.fall * error:
-        return Alertness(responses, responses[parameters.before][0], parameters.newest, xi)
+    level, fallen = float(before.mean()), float(np.median(newest))
+    if fallen < level - parameters.fall * error:
+        first = parameters.before + int(np.argmax(newest < 0.5 * (level + fallen)))
+        return Alertness(responses, responses[first][0], count - first, xi)
     return Alertness(responses)
 
 

@@ -6,12 +6,14 @@ import pytest
 from scipy import stats
 
 from pipeline import se3, shock
+from pipeline.belief import believe
 from pipeline.edge_search import EdgeWitnessParameters
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair
 from pipeline.run_length import AlarmBudget
 from pipeline.shock import Alertness, ShockParameters, believed, find_shock, heeded, weighed
+from pipeline.step_seeker import StepSeeker
 from pipeline.watch import Watch
 
 P = ShockParameters()
@@ -141,7 +143,8 @@ def test_responses_that_fall_together_open_the_search_at_the_first_of_them():
     assert heard([*CALM, 0.30, 0.31, 0.29]).since_ns is None
     assert heard([*CALM, 0.31, 0.30, 0.22]).since_ns is None
     assert heard([*CALM, 0.25, 0.24, 0.25]).since_ns == len(CALM) * TENTH
-    assert heard([*CALM, 0.31, 0.25, 0.24]).since_ns == len(CALM) * TENTH
+    late = heard([*CALM, 0.31, 0.25, 0.24])
+    assert (late.since_ns, late.after) == ((len(CALM) + 1) * TENTH, 2)
     assert heard([0.24] * 11).since_ns is None
 
 
@@ -151,4 +154,44 @@ def test_the_search_ends_and_is_opened_by_new_responses_only():
     assert still.since_ns == opened.since_ns
     over = heard([0.25] * 12, still, begin=len(CALM) + 21)
     assert over.since_ns is None
-    assert heard([*CALM, *CALM, 0.2, 0.2, 0.2], over, begin=60).since_ns == 75 * TENTH
+    assert heard([*CALM, *CALM, 0.2, 0.2, 0.2], over, begin=60).since_ns == 76 * TENTH
+
+
+def replayed(frames, seconds):
+    """The frames in an order without a trend, as if a standing vehicle saw one after the other."""
+    mixed = [frames[number] for number in (5, 2, 7, 0, 9, 4, 1, 8, 3, 6)]
+    stamps = [seconds * 10 * TENTH + number * TENTH for number in range(10)]
+    return [
+        dataclasses.replace(f, stamp_ns=stamp, distance_m=0.0) for f, stamp in zip(mixed, stamps, strict=True)
+    ]
+
+
+def sought(second, step):
+    """What a seeker says after each of two judgements, when the mount moves after a second."""
+    frames, mount = second
+    calm, after = replayed(frames, 0), moved(replayed(frames, 1), mount, step, 0)[:7]
+    belief = believe(mount, Parameters(), calm, [])
+    seeker = StepSeeker(mount, Parameters())
+    for frame in [*calm, *after]:
+        seeker.see(frame, belief)
+    due = seeker.due
+    said = [seeker.said([*calm, *after], belief, after[-1].stamp_ns) for _ in range(2)]
+    return seeker, due, said
+
+
+def test_a_seeker_tells_a_step_at_the_second_judgement_that_finds_it(second):
+    seeker, due, (once, twice) = sought(second, math.radians(0.5) * np.eye(6)[2])
+    assert due
+    assert once is None
+    assert twice.alarming
+    assert twice.over == "the last 0.6 s"
+    assert twice.drift[2] == pytest.approx(math.radians(0.5), abs=math.radians(0.1))
+    assert twice.onset.from_ns < twice.onset.stamp_ns == twice.onset.to_ns
+    seeker.forget()
+    assert not seeker.due
+
+
+def test_a_seeker_has_nothing_to_look_for_where_frames_respond_as_before(second):
+    _, due, said = sought(second, ZERO)
+    assert not due
+    assert said == [None, None]

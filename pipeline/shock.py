@@ -27,7 +27,8 @@ class ShockParameters:
     """When a step is looked for, and when it is believed.
 
     Attributes:
-        before: Frames whose mean response is what a frame is expected to have.
+        before: Frames whose mean response is what a frame is expected to have, at most.
+        least_before: The same at least: where a recording begins, a step may come soon.
         newest: Frames that must fall below it together: one may be dazzled.
         fall: By so many standard errors; asking in vain costs a second of judgements, so it may be low.
         open_ns: A step is looked for so long; by then the window holds frames from after it alone.
@@ -39,6 +40,7 @@ class ShockParameters:
     """
 
     before: int = 8
+    least_before: int = 5
     newest: int = 3
     fall: float = 3.0
     open_ns: int = 2_000_000_000
@@ -109,18 +111,18 @@ def heeded(
             return dataclasses.replace(alertness, after=alertness.after + 1)
         # What is believed has changed since then, and with it what a response is compared with.
         alertness = Alertness()
-    count = parameters.before + parameters.newest
-    responses = (*alertness.responses, (stamp_ns, response))[-count:]
-    if len(responses) < count:
+    responses = (*alertness.responses, (stamp_ns, response))[-parameters.before - parameters.newest :]
+    count = len(responses) - parameters.newest
+    if count < parameters.least_before:
         return Alertness(responses)
     values = np.array([value for _, value in responses])
-    before, newest = values[: parameters.before], values[parameters.before :]
+    before, newest = values[:count], values[count:]
     error = float(before.std(ddof=1)) * math.sqrt(1.0 / len(before) + 1.0 / len(newest))
     # The median: a frame that is dazzled, or behind a wiper, does not speak for those beside it.
     level, fallen = float(before.mean()), float(np.median(newest))
     if fallen < level - parameters.fall * error:
-        first = parameters.before + int(np.argmax(newest < 0.5 * (level + fallen)))
-        return Alertness(responses, responses[first][0], count - first, xi)
+        first = count + int(np.argmax(newest < 0.5 * (level + fallen)))
+        return Alertness(responses, responses[first][0], len(responses) - first, xi)
     return Alertness(responses)
 
 

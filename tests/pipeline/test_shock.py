@@ -148,6 +148,11 @@ def test_responses_that_fall_together_open_the_search_at_the_first_of_them():
     assert heard([0.24] * 11).since_ns is None
 
 
+def test_a_step_soon_after_the_beginning_opens_the_search_too():
+    assert heard([*CALM[:5], 0.25, 0.24, 0.25]).since_ns == 5 * TENTH
+    assert heard([*CALM[:4], 0.25, 0.24, 0.25]).since_ns is None
+
+
 def test_the_search_ends_and_is_opened_by_new_responses_only():
     opened = heard([*CALM, 0.25, 0.24, 0.25])
     still = heard([0.25] * 10, opened, begin=11)

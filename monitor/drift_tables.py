@@ -18,7 +18,7 @@ _TITLES: dict[Kind, str] = {
     "time-offset": "Wrong stamps of the images, no drift: 'drifted' would blame the mount.",
     "focal": "Wrong focal length, no drift: likewise.",
     "offline": "Axes of the camera, as in the published offline check.",
-    "slip": "A mount that moves along one axis at half of the drive; told, and until told, from then on.",
+    "slip": "A mount that moves along one axis at two thirds of the drive; told, and until told, after that.",
 }
 """Of the kinds that have a table label by label."""
 

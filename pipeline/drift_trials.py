@@ -51,7 +51,9 @@ RAMP_DEG = (0.25, 0.5, 1.0)
 
 SLIP_DEG = (0.1, 0.25, 0.5)
 SLIP_M = (0.05, 0.10, 0.20)
-"""Steps along one axis of a mount that held until half of the drive."""
+"""Steps along one axis of a mount that held until then."""
+SLIPS_AFTER = (2, 3)
+"""Share of a drive, so that one of two seconds shows the mount in its place before, and some frames after."""
 
 SHAKE_DEG = (0.1, 0.2, 0.4)
 """Root mean square angle of a camera that shakes faster than frames follow each other."""
@@ -88,7 +90,7 @@ class Trial:
         drift: float64 (6,), vehicle axes, rad and m: motion of the mount since the extrinsic was
             stored, at the end of the drive.
         ramp: Whether the drift grows evenly over the drive.
-        slips: Whether it comes at once, at half of the drive; with neither it is there from the first frame.
+        slips: Whether it comes at once, at two thirds of the drive. Else it is there from the first frame on.
         shake_rad: Root mean square angle by which the camera shakes, rad.
         late_ns: Images bear stamps that are later by so much, ns.
         focal: The stored focal length is so many times the true one.
@@ -120,7 +122,8 @@ class Trial:
 
     def first_wrong(self, frames: int) -> int:
         """The first frame, of so many, in which anything is wrong."""
-        return frames // 2 if self.slips else 0
+        part, whole = SLIPS_AFTER
+        return frames * part // whole if self.slips else 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

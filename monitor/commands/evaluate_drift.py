@@ -94,7 +94,7 @@ def command(
 
     RECORDING is anything that replay takes, with the extrinsic that it states as the truth. Kinds: healthy;
     combined (turned and moved at random); single (one axis); compensating (two axes that hide each other);
-    ramp; vibration; time-offset; focal; offline (a published table); slip (one axis, at half of the drive).
+    ramp; vibration; time-offset; focal; offline (a published table); slip (one axis, during the drive).
     With --out each run is kept as it ends, and the same command goes on where it was stopped.
     """
     import numpy as np  # noqa: PLC0415 - not needed for --help

@@ -104,9 +104,9 @@ DRIVES ?= $(wildcard $(addprefix $(CALIBWATCH_DATA)/,kitti_raw_0009_a kitti_raw_
 figures-drift: env
 	$(BIN)/calibwatch evaluate drift --simulated 4 --runs 6 --out $(OUT)/drift/simulated
 	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --baseline other --limits 0.5 0.1 \
-		--kinds healthy,combined,single,compensating,offline --out $(OUT)/drift/limits)
+		--kinds healthy,combined,single,compensating,ramp,vibration,time-offset,focal,offline --out $(OUT)/drift/limits)
 	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --baseline other --kinds healthy,combined --out $(OUT)/drift/usual)
-	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --limits 0.5 0.1 --kinds healthy,combined,single \
+	$(if $(DRIVES),$(BIN)/calibwatch evaluate drift $(DRIVES) --limits 0.5 0.1 --kinds healthy,combined,single,slip \
 		--out $(OUT)/drift/alone)
 	$(BIN)/python docs/drift_page.py $(OUT)/drift docs
 

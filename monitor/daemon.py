@@ -132,7 +132,7 @@ def watch(
         losses: What the source could not give, told at the end.
         stop: Ends the run early: what was written says that it is not complete.
         progress: Told the number of pairs after each one.
-        ahead: So many pairs are read before the first of them is judged, and looked at meanwhile in a thread
+        ahead: So many pairs are read before the first of them is judged, and looked at meanwhile in a process
             of their own. 0 for a source that goes on by itself: what came is then judged at once.
 
     Returns:
@@ -145,7 +145,7 @@ def watch(
         engine.attach(losses, lambda: watching_.outputs.losses)
     if ahead > 0:
         watches = {name: engine.watch for name, engine in watching_.engines.items()}
-        with closing(Forerunner(watches, watching_.clock)) as forerunner:
+        with closing(Forerunner(watches)) as forerunner:
             arrival_ns = _feed(watching_, messages, stop, progress, (ahead, forerunner))
     else:
         arrival_ns = _feed(watching_, messages, stop, progress, None)
@@ -159,7 +159,8 @@ def watch(
     note = "interrupted: what came after is not judged" if interrupted else ""
     lost = [f"output lost: {name}: {why}" for name, why in watching_.outputs.losses.items()]
     drops = drop_notes(_accounts(watching_), watching_.intake)
-    warnings = (*losses.notes, *watching_.intake.notes, *drops, *lost)
+    told = [f"{name}: {one}" for name, engine in watching_.engines.items() for one in engine.warnings]
+    warnings = (*losses.notes, *watching_.intake.notes, *drops, *told, *lost)
     parts = _parts(watching_)
     _tell(watching_, [EndEvent(complete=not interrupted, note=note, warnings=warnings, parts=parts)])
     memories = [engine.watch.memory for engine in watching_.engines.values()]

@@ -14,6 +14,7 @@ from monitor.lookahead import Ahead
 from monitor.sources import Losses
 from monitor.statements import Identity, Measured, status_of
 from monitor.status import Rates, Timing
+from monitor.wording import spin_warning
 from pipeline.candidate import Candidate, Proposal
 from pipeline.records import FramePair
 from pipeline.watch import Findings, Watch
@@ -82,6 +83,12 @@ class Engine:
     def dropped(self) -> Counter[str]:
         """Sweeps and images of pairs that gave no evidence, by reason."""
         return self._dropped
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the data say against the rig's settings, one sentence each."""
+        told = self.watch.spin_contradicted
+        return () if told is None else (spin_warning(told),)
 
     def attach(self, losses: Losses, outputs_lost: Callable[[], Mapping[str, str]]) -> None:
         """Names what else a status tells: messages that the source lost, and outputs that are lost."""
@@ -195,6 +202,7 @@ class Engine:
                 rates=self._rates(),
                 timing={name: _quantiles(values) for name, values in self._timing.items()},
                 outputs_lost=self._outputs_lost(),
+                warnings=self.warnings,
                 explanation=self.watch.inquiry.explanation,
                 track=self.watch.scenes.track,
                 left=self.watch.departed,

@@ -1,22 +1,19 @@
-"""Pairs looked at before their turn, in a thread of its own, while those before them are judged.
+"""Pairs looked at before their turn, in a process of its own, while those before them are judged.
 
 What a pair says by itself does not wait for the verdict on the pair before, except where that makes the
 watch forget (a gap, a clock that runs back): what was found ahead is then void, and begun anew. Verdicts are
-those of one pair after the other.
+those of one pair after the other. Where there is no other process, or it fails, pairs are looked at in turn.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 
-from monitor.clock import Clock
 from monitor.intake import Accounts, Intake
+from monitor.lookout import Lookout
 from monitor.messages import Message
 from monitor.sources import Tick
 from pipeline.errors import CalibwatchError
-from pipeline.frame_evidence import Scout
 from pipeline.records import FramePair
 from pipeline.watch import Foresight, Watch
 
@@ -79,80 +76,67 @@ def arrivals(
 
 
 class Forerunner:
-    """Looks at pairs in a thread, one after the other.
+    """Has pairs looked at, one after the other.
 
     Args:
         watches: Who will judge them, by name of the pair.
-        clock: Measures the stages.
     """
 
-    def __init__(self, watches: Mapping[str, Watch], clock: Clock) -> None:
+    def __init__(self, watches: Mapping[str, Watch]) -> None:
         self._watches = watches
-        self._clock = clock
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="lookahead")
-        self._runs: dict[str, _Run] = {}
-        self._pending: dict[str, deque[tuple[FramePair, Future[Ahead | None]]]] = {}
+        self._seen = 0
+        self._lookout: Lookout | None = None
+        self._breaks: dict[str, int] = {}
+        self._pending: dict[str, deque[tuple[FramePair, int | None]]] = {}
 
     def see(self, pair: FramePair) -> None:
         """A pair that will come to its turn."""
-        if pair.pair not in self._runs:
-            self._begin(pair.pair)
-        future = self._worker.submit(self._runs[pair.pair].look, pair)
-        self._pending.setdefault(pair.pair, deque()).append((pair, future))
+        self._seen += 1
+        if self._lookout is None and self._seen == _WORTH_A_PROCESS:
+            equipment = {
+                name: (watch.mount, watch.parameters, watch.segmenter)
+                for name, watch in self._watches.items()
+            }
+            self._lookout = Lookout(equipment)
+        number = None
+        if self._lookout is not None and self._holds(pair.pair):
+            number = self._lookout.ask(pair)
+        self._pending.setdefault(pair.pair, deque()).append((pair, number))
 
     def take(self, pair: FramePair) -> Ahead | None:
-        """What was found in the pair whose turn it is; None where it has to be looked at again."""
-        first, future = self._pending[pair.pair].popleft()
+        """What was found in the pair whose turn it is; None where it has to be looked at now."""
+        first, number = self._pending[pair.pair].popleft()
         assert first is pair  # noqa: S101 - pairs come to their turn in the order in which they were seen
-        if self._void(pair.pair):
-            future.cancel()
+        if self._lookout is None or number is None:
             return None
-        return future.result()
+        found = self._lookout.answer(number)
+        if found is None:
+            self._breaks.pop(pair.pair, None)
+            return None
+        breaks = self._breaks.get(pair.pair)
+        if breaks is None or not self._holds(pair.pair):
+            return None
+        return Ahead(Foresight(found.evidence, found.scout, breaks), found.spent)
 
     def settle(self, name: str) -> None:
         """The turn of a pair is over: what was found ahead of something that was forgotten is begun anew."""
-        if not self._void(name):
+        if self._holds(name) or self._lookout is None or not self._lookout.ready():
             return
-        self._runs[name].void = True
-        self._begin(name)
+        watch = self._watches[name]
+        self._lookout.begin(name, watch.scout())
+        self._breaks[name] = watch.breaks
         pending = self._pending[name]
-        self._pending[name] = deque()
-        for pair, future in pending:
-            future.cancel()
-            self.see(pair)
+        self._pending[name] = deque((pair, self._lookout.ask(pair)) for pair, _ in pending)
 
     def close(self) -> None:
-        """Ends the thread; what it still had to do is left."""
-        self._worker.shutdown(cancel_futures=True)
+        """Ends the process; what it still had to do is left."""
+        if self._lookout is not None:
+            self._lookout.close()
 
-    def _void(self, name: str) -> bool:
-        return self._runs[name].breaks != self._watches[name].breaks
-
-    def _begin(self, name: str) -> None:
-        watch = self._watches[name]
-        self._runs[name] = _Run(watch.scout(), watch.breaks, self._clock)
+    def _holds(self, name: str) -> bool:
+        """Whether what is found ahead is what will be asked for."""
+        return self._breaks.get(name) == self._watches[name].breaks
 
 
-class _Run:
-    """Pairs of one stream from one break to the next."""
-
-    def __init__(self, scout: Scout, breaks: int, clock: Clock) -> None:
-        self.breaks = breaks
-        self.void = False
-        self._scout = scout
-        self._clock = clock
-
-    def look(self, pair: FramePair) -> Ahead | None:
-        """What the next pair says; None where nobody will ask for it. Called in the thread alone."""
-        if self.void:
-            return None
-        spent: list[tuple[str, float]] = []
-
-        @contextmanager
-        def stage(name: str) -> Iterator[None]:
-            begun = self._clock.monotonic_ns()
-            yield
-            spent.append((name, (self._clock.monotonic_ns() - begun) / 1e6))
-
-        evidence = self._scout.look(pair, stage)
-        return Ahead(Foresight(evidence, self._scout.copy(), self.breaks), tuple(spent))
+_WORTH_A_PROCESS = 25
+"""Pairs; a process needs the time of some 20 of them to be there."""

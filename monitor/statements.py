@@ -72,6 +72,7 @@ class Measured:
         rates: Of the inputs.
         timing: Stage -> quantiles.
         outputs_lost: Output -> what happened.
+        warnings: What the data say against the rig's settings.
         explanation: What the drive says of mount, clock and lens, or None.
         track: Where the mount is by all scenes of the drive, or None.
         left: Reason -> frames that left the window.
@@ -85,6 +86,7 @@ class Measured:
     rates: Rates
     timing: Mapping[str, Timing]
     outputs_lost: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
     explanation: Explanation | None = None
     track: SceneTrack | None = None
     left: Mapping[Departure, int] = field(default_factory=dict)
@@ -135,6 +137,7 @@ def status_of(
         model=identity.model,
         software=identity.software,
         outputs_lost=dict(measured.outputs_lost),
+        warnings=measured.warnings,
     )
 
 

@@ -279,6 +279,9 @@ class Status(_Part):
     outputs_lost: dict[Code, str] = Field(
         default={}, description="output -> what happened: recording lost, disk full, ..."
     )
+    warnings: tuple[str, ...] = Field(
+        default=(), description="what the data say against the rig's settings, one sentence each"
+    )
 
     def to_json(self) -> str:
         """One line of JSON."""

@@ -3,6 +3,7 @@
 from datetime import UTC, datetime, timedelta
 
 from monitor.status import AxisDrift, AxisName, State, Status, unit_of
+from pipeline.motion import ToldSpin
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -174,3 +175,16 @@ def _clause(sentence: str) -> str:
     clause = sentence.rstrip(". ")
     head, _, _ = clause.partition(" ")
     return clause if head[1:] != head[1:].lower() else clause[:1].lower() + clause[1:]
+
+
+def spin_warning(told: ToldSpin) -> str:
+    """What to tell where the sweeps contradict the sense of rotation that the rig states."""
+    if told == "one instant":
+        return (
+            "the sweeps are not bent by the drive, as if they had been brought to one instant before, yet "
+            "the rig states a sense of rotation: leave lidar.spin out"
+        )
+    return (
+        f"the sweeps bend as those of a LiDAR that turns {told}, the rig states the other: set lidar.spin to "
+        f"{told!r}"
+    )

@@ -1,7 +1,8 @@
 """The ego motion of the LiDAR, tracked from sweep to sweep, and sweeps straightened by it (FORMULAS G3).
 
 A cloud with times per point is straightened by them. One without is straightened by its azimuths where the
-sense of rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise.
+sense of rotation is configured or told by the bend of the sweeps themselves, and left as it is otherwise. A
+sense that is configured is held against that bend.
 """
 
 import copy
@@ -14,6 +15,7 @@ from pipeline.deskew import Spin, SpinSense, Twist, deskew, sweep_times
 from pipeline.motion import (
     Motion,
     SpinEvidence,
+    ToldSpin,
     estimate_twist,
     spin_evidence,
     spin_sense,
@@ -48,6 +50,9 @@ _LONGEST_TURN_S = 0.3
 _MOST_EVIDENCE = 12
 """Pairs of sweeps that are asked for the sense of rotation; a vehicle that stands never tells it."""
 
+_TELLING_M_S = 3.0
+"""m/s; slower sweeps are not bent enough to hold a configured sense against them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Straightened:
@@ -81,7 +86,9 @@ class Ego:
         self._axis = axis
         self._ahead = ahead
         self._sense: SpinSense | None = spin
-        self._asked = spin is not None
+        self._configured = spin
+        self._told: ToldSpin | None = None
+        self._asked = False
         self._evidence: list[SpinEvidence] = []
         self._recent: deque[tuple[int, Surfels]] = deque(maxlen=_ASK_APART)
         self._period_s: float | None = None
@@ -96,6 +103,11 @@ class Ego:
     def twist(self) -> Twist | None:
         """Motion at the last registration, or None where it is not known."""
         return self._twist
+
+    @property
+    def contradicted(self) -> ToldSpin | None:
+        """What the sweeps say of the rotation where they surely say other than is configured, else None."""
+        return None if self._configured in (None, self._told) else self._told
 
     def copy(self) -> "Ego":
         """Another that goes on from here."""
@@ -149,18 +161,27 @@ class Ego:
         found = estimate_twist(before, seen, seconds, self._twist)
         self._twist = found.twist if isinstance(found, Motion) else None
         self._tracked_ns = pair.cloud_stamp_ns if self._twist is not None else None
-        if not self._asks(pair):
+        if self._asked or pair.cloud.time is not None:
             return
-        turn_s = self._turn_s(pair)
-        if len(self._recent) == _ASK_APART and self._twist is not None and turn_s is not None:
-            earlier_ns, earlier = self._recent[0]
-            apart_s = (pair.cloud_stamp_ns - earlier_ns) / _NS
-            self._ask(spin_evidence(earlier, seen, apart_s, turn_s, self._axis, self._twist))
+        turn_s, earlier = self._turn_s(pair), self._earlier()
+        if earlier is not None and self._twist is not None and turn_s is not None:
+            apart_s = (pair.cloud_stamp_ns - earlier[0]) / _NS
+            self._ask(spin_evidence(earlier[1], seen, apart_s, turn_s, self._axis, self._twist))
         self._recent.append((pair.cloud_stamp_ns, seen))
 
     def _asks(self, pair: FramePair) -> bool:
         """Whether the sense of rotation is still open and this sweep may tell it."""
-        return not self._asked and pair.cloud.time is None
+        return not self._asked and pair.cloud.time is None and self._configured is None
+
+    def _earlier(self) -> tuple[int, Surfels] | None:
+        """The sweep that one is held against to tell the sense of rotation, and its stamp; None: not now.
+
+        Where it is configured only sweeps that are registered anyway are asked, and only in motion.
+        """
+        if self._configured is None:
+            return self._recent[0] if len(self._recent) == _ASK_APART else None
+        moving = self._twist is not None and float(np.linalg.norm(self._twist.velocity)) > _TELLING_M_S
+        return self._recent[-1] if self._recent and moving else None
 
     def _turn_s(self, pair: FramePair) -> float | None:
         """Duration of a turn: as the source states it, else the time from one sweep to the next."""
@@ -176,7 +197,10 @@ class Ego:
         if isinstance(answer, SpinEvidence):
             self._evidence.append(answer)
         told = spin_sense(self._evidence)
+        self._told = told
         self._asked = told is not None or self._tried >= _MOST_EVIDENCE
+        if self._configured is not None:
+            return
         self._one_instant = told == "one instant"
         if told == "cw" or told == "ccw":  # noqa: PLR1714 - narrows the type
             self._sense = told

@@ -20,6 +20,7 @@ from pipeline.gradients import gradient_pyramid
 from pipeline.ground import Ground, fit_ground
 from pipeline.line_witness import LineFrame
 from pipeline.masks import horizon_line, masks_from_probabilities
+from pipeline.motion import ToldSpin
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
@@ -114,6 +115,11 @@ class Scout:
     def count(self) -> int:
         """Pairs that were looked at."""
         return self._count
+
+    @property
+    def spin_contradicted(self) -> ToldSpin | None:
+        """What the sweeps say of the rotation where they surely say other than is configured, else None."""
+        return self._ego.contradicted
 
     def copy(self) -> "Scout":
         """Another scout that goes on from here."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipeline.deskew import SpinSense, Twist, displaced
+from pipeline.deskew import Twist, displaced
 from pipeline.ground import plane_basis
 from pipeline.records import Floats, PointCloud, read_only
 from pipeline.surfels import Surfels, surfels
@@ -387,7 +387,11 @@ def spin_evidence(
     return SpinEvidence(turns, math.sqrt(variance))
 
 
-def spin_sense(evidence: Sequence[SpinEvidence]) -> SpinSense | Literal["one instant"] | None:
+ToldSpin: TypeAlias = Literal["cw", "ccw", "one instant"]
+"""What sweeps say of the rotation; one instant: their points were brought to one, or are a flash's."""
+
+
+def spin_sense(evidence: Sequence[SpinEvidence]) -> ToldSpin | None:
     """What several pairs of sweeps say together; None while they leave it open.
 
     The weighted mean must lie nearer to -1, 0 or +1 than to the next of them by three standard deviations,
@@ -402,7 +406,7 @@ def spin_sense(evidence: Sequence[SpinEvidence]) -> SpinSense | Literal["one ins
     nearest = round(mean)
     if abs(mean - nearest) + _SURE * math.sqrt(max(1.0, scatter) / float(weight.sum())) > _HALF_WAY:
         return None
-    senses: dict[int, SpinSense | Literal["one instant"]] = {-1: "cw", 0: "one instant", 1: "ccw"}
+    senses: dict[int, ToldSpin] = {-1: "cw", 0: "one instant", 1: "ccw"}
     return senses.get(nearest)
 
 

@@ -8,6 +8,7 @@ image px: cell (i, j) lies at image px ``(i + 0.5) / scale_x - 0.5, (j + 0.5) / 
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -154,6 +155,11 @@ class Segmenter:
             version=metadata.get("model_version", ""),
             training_data=metadata.get("training_data_sha256", ""),
         )
+        self._made_of = model, threads
+
+    def __reduce__(self) -> tuple[Callable[[bytes, int], "Segmenter"], tuple[bytes, int]]:
+        """Another process makes its own session, of the same bytes."""
+        return _segmenter, self._made_of
 
     def probabilities(self, image_bgr: NDArray[np.generic]) -> NDArray[np.float32]:
         """Return what each cell of the image shows.
@@ -183,6 +189,10 @@ class Segmenter:
                 f"the model gave {answer.shape} for a grid of {columns}x{rows}", hint=_TRAIN_HINT
             )
         return cells
+
+
+def _segmenter(model: bytes, threads: int) -> Segmenter:
+    return Segmenter(model, threads=threads)
 
 
 def _check_contract(metadata: dict[str, str]) -> None:

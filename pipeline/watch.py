@@ -18,6 +18,7 @@ from pipeline.edge_witness import EdgeFrame
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, edge_frame, unmeasured
 from pipeline.inquiry import Inquiry
 from pipeline.line_witness import LineFrame
+from pipeline.motion import ToldSpin
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
@@ -76,6 +77,7 @@ class Watch:
     def __init__(self, mount: Mount, parameters: Parameters, segmenter: Segmenter | None) -> None:
         self.mount = mount
         self.parameters = parameters
+        self.segmenter = segmenter
         self.memory: verdict.Memory | None = None
         self.belief: Belief | None = None
         self.frames = 0
@@ -117,6 +119,11 @@ class Watch:
     def line_stamps(self) -> tuple[int, ...]:
         """Stamps of the frames with lines in the window, ns."""
         return tuple(stamp for stamp, _ in self._line_frames)
+
+    @property
+    def spin_contradicted(self) -> ToldSpin | None:
+        """What the sweeps say of the rotation where they surely say other than is configured, else None."""
+        return self._scout.spin_contradicted
 
     def scout(self) -> Scout:
         """Another scout that looks at the next pair as this watch would."""

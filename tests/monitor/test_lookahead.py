@@ -1,6 +1,8 @@
 """Pairs looked at ahead of their turn: everything that is told is what one pair after the other gives."""
 
 import dataclasses
+import os
+import signal
 import threading
 
 import numpy as np
@@ -10,6 +12,7 @@ from monitor.daemon import watch, watching
 from monitor.events import EndEvent, FrameEvent, ProposalEvent, StatusEvent
 from monitor.intake import Intake
 from monitor.lookahead import arrivals
+from monitor.lookout import Lookout
 from monitor.messages import Message
 from monitor.outputs import Outputs
 from monitor.preparation import prepare
@@ -53,6 +56,27 @@ class Told:
 
     def close(self):
         pass
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch):
+    """Short streams are looked at ahead, too, from their second pair on."""
+    monkeypatch.setattr("monitor.lookahead._WORTH_A_PROCESS", 1)
+    monkeypatch.setattr("monitor.lookout._PATIENCE_S", 60.0)
+
+
+@pytest.fixture
+def looked_at(monkeypatch):
+    """Pairs that this very process has looked at."""
+    pairs = []
+    look = Scout.look
+
+    def noted(self, pair, *arguments):
+        pairs.append(pair)
+        return look(self, pair, *arguments)
+
+    monkeypatch.setattr(Scout, "look", noted)
+    return pairs
 
 
 @pytest.fixture
@@ -114,18 +138,46 @@ def test_all_that_is_told_is_the_same(rig, messages, story):
     assert told_of(rig, stream, 5) == plainly
 
 
-def test_what_is_found_ahead_is_used(rig, messages, monkeypatch):
-    threads = []
-    look = Scout.look
-
-    def noted(self, *arguments):
-        threads.append(threading.current_thread().name)
-        return look(self, *arguments)
-
-    monkeypatch.setattr(Scout, "look", noted)
+def test_what_is_found_ahead_is_used(rig, messages, looked_at):
     told_of(rig, stories(messages)["in order"], 5)
-    # The last pair is decided when the recording ends, which no thread can know.
-    assert sum(name.startswith("lookahead") for name in threads) == len(threads) - 1
+    # The first pair is judged while the process begins; the last is decided when the recording ends.
+    assert len(looked_at) == 2
+
+
+def test_a_process_that_dies_is_done_without(rig, messages, looked_at, monkeypatch):
+    stream = stories(messages)["in order"]
+    plainly = told_of(rig, stream, 0)
+    alone = len(looked_at)
+    looked_at.clear()
+    answer = Lookout.answer
+
+    def killed(self, number):
+        if number == 4:
+            os.kill(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        return answer(self, number)
+
+    monkeypatch.setattr(Lookout, "answer", killed)
+    assert told_of(rig, stream, 5) == plainly
+    assert 2 < len(looked_at) < alone
+
+
+def test_what_a_process_fails_at_is_met_here(rig, messages, looked_at, monkeypatch):
+    stream = stories(messages)["in order"]
+    plainly = told_of(rig, stream, 0)
+    looked_at.clear()
+    ask = Lookout.ask
+
+    def spoilt(self, pair):
+        # A pair that no scout can look at arrives over there.
+        give = dataclasses.replace(pair, cloud_stamp_ns=None) if self._count == 3 else pair
+        number = ask(self, give)
+        self._asked[-1] = (number, pair)
+        return number
+
+    monkeypatch.setattr(Lookout, "ask", spoilt)
+    assert told_of(rig, stream, 5) == plainly
+    assert len(looked_at) == 3
 
 
 def test_a_run_that_is_stopped_tells_what_was_judged(rig, messages):

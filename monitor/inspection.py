@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from monitor.baseline_file import with_baselines
+from monitor.daemon import mount_of
 from monitor.discovery import TF_TYPES, Survey, discover, survey_in
 from monitor.inspection_report import (
     CloudReport,
@@ -31,11 +32,13 @@ from monitor.rig import Rig, RigPair, camera_from_info, is_cloud, load_rig
 from monitor.sources import Source, Tick, TopicInfo, kinds, open_source
 from monitor.sources.kitti_raw import NOMINAL_PERIOD_NS
 from monitor.sync import middle_ns, pairer_for
+from monitor.wording import spin_warning
 from pipeline.cameras import project
 from pipeline.errors import CalibwatchError, InputError
 from pipeline.records import CameraModel, PointCloud
 from pipeline.rings import scan_pattern
 from pipeline.se3 import apply, inverse
+from pipeline.spin_check import told_spin
 
 _SWEEPS = 5
 """Sweeps per topic that are decoded: enough to tell a constant number of points from a changing one."""
@@ -291,7 +294,18 @@ def _pair(pair: RigPair, how: str, seen: Mapping[str, _Seen], topics: Sequence[T
         clock_offset_ms=_clock_offset_ms(by_name[lidar], by_name[camera]),
         in_view=in_view,
         problems=tuple(_problems(pair, by_name, len(gaps), nearest, in_view)),
+        warnings=_warnings(pair, sweeps),
     )
+
+
+def _warnings(pair: RigPair, sweeps: _Seen) -> tuple[str, ...]:
+    """What the first sweeps say against the sense of rotation that the rig states."""
+    spin, clouds = pair.lidar.spin, sweeps.clouds
+    if spin is None or pair.camera.model is None or any(cloud.time is not None for _, cloud, _ in clouds):
+        return ()
+    told_s = next((sweep_s for _, _, sweep_s in clouds if sweep_s is not None), None)
+    told = told_spin([(stamp_ns, cloud) for stamp_ns, cloud, _ in clouds], told_s, mount_of(pair).up)
+    return () if told in (None, spin) else (spin_warning(told),)
 
 
 def _gaps(pair: RigPair, sweeps: _Seen, images: _Seen, middle: int) -> list[float]:

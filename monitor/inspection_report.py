@@ -100,6 +100,9 @@ class PairReport(_Part):
     )
     in_view: tuple[int, int] | None = Field(description="points of the first sweep inside the image, of all")
     problems: tuple[str, ...] = Field(description="what will keep it from being judged, one sentence each")
+    warnings: tuple[str, ...] = Field(
+        default=(), description="what the data say against the rig's settings, one sentence each"
+    )
 
 
 class Inspection(_Part):

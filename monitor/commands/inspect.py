@@ -121,6 +121,8 @@ def _pair(pair: "PairReport", lidar: "TopicReport") -> Iterator[str]:
         yield f"    {pair.in_view[0]} of {pair.in_view[1]} points of the first sweep fall into the image"
     for problem in pair.problems:
         yield f"    problem: {problem}"
+    for warning in pair.warnings:
+        yield f"    warning: {warning}"
 
 
 def _gap(pair: "PairReport", lidar: "TopicReport") -> str:

@@ -136,7 +136,7 @@ def plucker(start: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Moments and unit directions (N,3) of lines through points (N,3), (N,3) (PLK (1), both normalised)."""
     span = end - start
     length = np.linalg.norm(span, axis=1, keepdims=True)
-    return np.cross(start, end) / length, span / length
+    return _crossed(start, end, np.empty_like(span)) / length, span / length
 
 
 def _in_camera(pairs: LinePairs, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
@@ -144,7 +144,7 @@ def _in_camera(pairs: LinePairs, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
     n, v = plucker(pairs.start, pairs.end)
     R, t = T_cam_lidar[:3, :3], T_cam_lidar[:3, 3]
     v_cam = v @ R.T
-    return n @ R.T + np.cross(t, v_cam), v_cam
+    return n @ R.T + _crossed(t, v_cam, np.empty_like(v_cam)), v_cam
 
 
 def residuals(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
@@ -152,29 +152,46 @@ def residuals(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
     n_cam, _ = _in_camera(pairs, T_cam_lidar)
     line = n_cam @ line_matrix(K).T
     norm = np.hypot(line[:, 0], line[:, 1])
-    return _ends_times(pairs, line) / norm[:, None]
+    return np.asarray(np.einsum("nki,ni->nk", _ends(pairs), line) / norm[:, None])
 
 
 def jacobians(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> Floats:
     """Derivative (N,2,6) of the residuals by (phi, rho): PLK (6), signs of the left perturbation."""
+    return _distances(pairs, K, T_cam_lidar)[1]
+
+
+def _distances(pairs: LinePairs, K: Floats, T_cam_lidar: Floats) -> tuple[Floats, Floats]:
+    """The residuals (N,2) and their derivative (N,2,6)."""
     n_cam, v_cam = _in_camera(pairs, T_cam_lidar)
     K_line = line_matrix(K)
     line = n_cam @ K_line.T
     norm = np.hypot(line[:, 0], line[:, 1])
     flat = line * [1.0, 1.0, 0.0]
-    product = _ends_times(pairs, line)
-    ends = np.stack([_homogeneous(pairs.image_start), _homogeneous(pairs.image_end)], axis=1)
+    ends = _ends(pairs)
+    product = np.einsum("nki,ni->nk", ends, line)
     d_line = (ends - (product / norm[:, None] ** 2)[:, :, None] * flat[:, None, :]) / norm[:, None, None]
     d_normal = d_line @ K_line
+    slopes = np.empty((len(line), 2, 6))
     # -a^T [n] = (n x a)^T for each row a.
-    d_phi = np.cross(n_cam[:, None, :], d_normal)
-    d_rho = np.cross(v_cam[:, None, :], d_normal)
-    return np.concatenate([d_phi, d_rho], axis=2)
+    _crossed(n_cam[:, None, :], d_normal, slopes[:, :, :3])
+    _crossed(v_cam[:, None, :], d_normal, slopes[:, :, 3:])
+    return product / norm[:, None], slopes
 
 
-def _ends_times(pairs: LinePairs, line: Floats) -> Floats:
-    ends = np.stack([_homogeneous(pairs.image_start), _homogeneous(pairs.image_end)], axis=1)
-    return np.asarray(np.einsum("nki,ni->nk", ends, line))
+def _crossed(a: Floats, b: Floats, out: Floats) -> Floats:
+    """``a x b`` along the last axis into ``out``: for few lines a fraction of what ``np.cross`` takes."""
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
+    return out
+
+
+def _ends(pairs: LinePairs) -> Floats:
+    """Both ends of the image lines, homogeneous, (N,2,3)."""
+    ends = np.ones((len(pairs), 2, 3))
+    ends[:, 0, :2] = pairs.image_start
+    ends[:, 1, :2] = pairs.image_end
+    return ends
 
 
 def _homogeneous(uv: Floats) -> Floats:
@@ -311,13 +328,15 @@ class _Normal:
 
 def _linearise(pairs: LinePairs, white: Floats, K: Floats, T_cam_lidar: Floats) -> _Normal:
     """Robust cost (PLK (5), squared and weighted), information and gradient (FORMULAS D2)."""
-    r = np.einsum("nij,nj->ni", white, residuals(pairs, K, T_cam_lidar))
-    J = white @ jacobians(pairs, K, T_cam_lidar)
+    distances, slopes = _distances(pairs, K, T_cam_lidar)
+    r = np.einsum("nij,nj->ni", white, distances)
     distance = np.hypot(r[:, 0], r[:, 1])
     weight = np.minimum(1.0, HUBER / np.maximum(distance, 1e-12))
     cost = np.where(distance <= HUBER, 0.5 * distance**2, HUBER * (distance - 0.5 * HUBER)).sum()
-    information = np.einsum("n,nki,nkj->ij", weight, J, J)
-    gradient = -np.einsum("n,nki,nk->i", weight, J, r)
+    root = np.sqrt(weight)[:, None]
+    J = ((root[:, :, None] * white) @ slopes).reshape(-1, 6)
+    information = J.T @ J
+    gradient = -(root * r).reshape(-1) @ J
     return _Normal(float(cost), information, gradient, distance)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.deskew import Spin, SpinSense, Twist, deskew, sweep_times
 from pipeline.motion import (
+    TELLING_M_S,
     Motion,
     SpinEvidence,
     ToldSpin,
@@ -49,9 +50,6 @@ _LONGEST_TURN_S = 0.3
 
 _MOST_EVIDENCE = 12
 """Pairs of sweeps that are asked for the sense of rotation; a vehicle that stands never tells it."""
-
-_TELLING_M_S = 3.0
-"""m/s; slower sweeps are not bent enough to hold a configured sense against them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +178,7 @@ class Ego:
         """
         if self._configured is None:
             return self._recent[0] if len(self._recent) == _ASK_APART else None
-        moving = self._twist is not None and float(np.linalg.norm(self._twist.velocity)) > _TELLING_M_S
+        moving = self._twist is not None and float(np.linalg.norm(self._twist.velocity)) > TELLING_M_S
         return self._recent[-1] if self._recent and moving else None
 
     def _turn_s(self, pair: FramePair) -> float | None:

@@ -96,6 +96,9 @@ _SURE = 3.0
 _LEAST_PAIRS = 3
 """Pairs of sweeps behind a spin sense: fewer show no scatter, and one distorted sweep would decide."""
 
+TELLING_M_S = 3.0
+"""m/s; slower sweeps are not bent enough to hold a configured sense of rotation against them."""
+
 VARIANCE_INFLATION = 4.0
 """Neighbouring surfels err together (one wall, one bend of the road): seen as scatter of twice the plain
 sigma."""

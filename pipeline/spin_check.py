@@ -2,7 +2,19 @@
 
 from collections.abc import Sequence
 
-from pipeline.motion import LONGEST_S, SpinEvidence, ToldSpin, spin_evidence, spin_sense
+import numpy as np
+
+from pipeline.deskew import Twist
+from pipeline.motion import (
+    LONGEST_S,
+    TELLING_M_S,
+    Motion,
+    SpinEvidence,
+    ToldSpin,
+    estimate_twist,
+    spin_evidence,
+    spin_sense,
+)
 from pipeline.records import Floats, PointCloud
 from pipeline.surfels import surfels
 
@@ -20,12 +32,17 @@ def told_spin(
         sweep_s: Duration of a turn, s; None: the time from one sweep to the next.
         axis: float64 (3,), unit, LiDAR frame: the spin axis, upwards.
     """
+    start: Twist | None = None
     found, planes = [], [(stamp_ns, surfels(cloud)) for stamp_ns, cloud in sweeps]
     for (before_ns, before), (now_ns, now) in zip(planes, planes[_APART:], strict=False):
         seconds = (now_ns - before_ns) / 1e9
         if not 0.0 < seconds <= LONGEST_S:
             continue
-        answer = spin_evidence(before, now, seconds, sweep_s or seconds / _APART, axis, None)
+        motion = estimate_twist(before, now, seconds, start)
+        start = motion.twist if isinstance(motion, Motion) else None
+        if start is None or float(np.linalg.norm(start.velocity)) < TELLING_M_S:
+            continue
+        answer = spin_evidence(before, now, seconds, sweep_s or seconds / _APART, axis, start)
         if isinstance(answer, SpinEvidence):
             found.append(answer)
     return spin_sense(found)

@@ -77,6 +77,7 @@ STATUS = {
     "model": {"hash": None, "version": None},
     "software": "calibwatch 0.1.0",
     "outputs_lost": {"recording": "No space left on device"},
+    "warnings": ["the sweeps turn the other way"],
 }
 
 

@@ -134,7 +134,9 @@ def _smallest(rows: Sequence[Smallest]) -> Iterator[str]:
     groups = list(dict.fromkeys(one.group for one in rows))
     for unit, axes in (("deg", ("roll", "pitch", "yaw")), ("m", ("forward", "left", "up"))):
         chosen = [one for one in rows if one.axis in axes]
-        amounts = list(dict.fromkeys(amount for one in chosen for amount in one.shares))
+        amounts = sorted({amount for one in chosen for amount in one.shares}, key=float)
+        if not amounts:
+            continue
         yield f"| drive | axis | {' | '.join(f'{a} {unit}' for a in amounts)} | found | suspected |"
         yield "|---|---|" + "---|" * (len(amounts) + 2)
         for group in groups:

@@ -109,6 +109,14 @@ def test_a_slip_is_told_from_when_on_it_was_there():
     assert "| a | yaw 0.25 deg | 4 | 2/4 | 3 drifted, 1 suspect | 0.2 | 3 |" in drift_text(found)
 
 
+def test_amounts_stand_in_their_order_and_those_that_were_not_run_nowhere():
+    rows = [single(2, 1.0, 0, told=True), single(1, 0.25, 1, told=False), single(2, 0.5, 2, told=True)]
+    text = drift_text(summary_of(HEADER, rows))
+    assert "| drive | axis | 0.25 deg | 0.5 deg | 1 deg | found | suspected |" in text
+    assert "| a | yaw | - | 1/1 | 1/1 | 0.5 deg | 0.5 deg |" in text
+    assert "forward" not in text
+
+
 def test_errors_fall_into_the_cells_of_the_stanford_diagram():
     """Reference of 0.2 deg and 5 cm is allowed; alert limits are 0.5 deg and 0.1 m."""
     cases = {

@@ -23,7 +23,7 @@ from pipeline.segmentation import Segmenter
 OUTPUTS = ("status_log", "summary", "recording", "report", "candidate")
 """What a replay writes (DESIGN 7)."""
 
-_AHEAD = 4
+_AHEAD = 6
 """Pairs read before the first of them is judged: a judgement takes as long as some others are looked at."""
 
 FILE_NAMES = (FILE_NAME, "status.jsonl", "report.html", "recording.rrd")

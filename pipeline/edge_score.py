@@ -164,6 +164,13 @@ def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Flo
         Score (weighted mean response), gradient float64 (6,) by (phi, rho) at ``T_cam_lidar``, and float64
         (N,6) whose sum is the gradient. The direction across each edge is held while differentiating.
     """
+    return score_by_edge(batch, T_cam_lidar, level)[0]
+
+
+def score_by_edge(
+    batch: EdgeBatch, T_cam_lidar: Floats, level: int
+) -> tuple[tuple[float, Floats, Floats], Floats]:
+    """What :func:`score` and :func:`score_only` give, for the price of one."""
     value, by_point, points = _respond(batch, T_cam_lidar, level)
     total = float(batch.weight.sum())
     w = batch.weight / total
@@ -171,7 +178,8 @@ def score(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Flo
     _by_turn(points, by_point, share)
     share[3:] = by_point
     share *= w
-    return float(batch.weight @ value) / total, share.sum(axis=1), share.T
+    scored = float(batch.weight @ value) / total, share.sum(axis=1), share.T
+    return scored, batch.weight * value
 
 
 def score_and_gradient(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[float, Floats]:

@@ -24,6 +24,7 @@ from pipeline.edge_score import (
     preference,
     score,
     score_and_gradient,
+    score_by_edge,
     score_only,
 )
 from pipeline.edge_search import (
@@ -158,8 +159,7 @@ def solve(
     before = None if trail is None else (trail.inside, H)
     inside = _best_inside(batch, T_stored, (stored, best), floor, parameters, before)
     background, spread = _over_frames(batch, shares)
-    value, _, share = score(batch, T_best, 0)
-    at_best = score_only(batch, T_best, 0)
+    (value, _, share), at_best = score_by_edge(batch, T_best, 0)
     at_inside = score_only(batch, se3.retract(T_stored, inside), 0)
     penalty = _PENALTY * float(inside @ np.linalg.solve(floor, inside))
     return EdgeSolution(

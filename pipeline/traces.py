@@ -61,16 +61,21 @@ class WindowTrace:
 def spread(stamps_ns: Sequence[int], most: int) -> list[int]:
     """Indices of ascending stamps that stay: the newest densely, one per sixteenth of the age further back.
 
-    Slots of time are fixed, each made of two of half its length, so that what stays now was kept before.
+    Time is cut at fixed places into slots, each made of two of half its length; the first stamp of a slot
+    stays. Slots join when all of the longer one is old enough for its length, so that they only ever grow, and
+    thinning again and again keeps what thinning at once would.
     """
     newest = stamps_ns[-1]
     kept: list[int] = []
-    taken: set[tuple[int, int]] = set()
+    last: tuple[int, int] | None = None
     for index, stamp in enumerate(stamps_ns):
         width = max((newest - stamp) >> _SHARE_BITS, 1).bit_length() - 1
+        end = ((stamp >> width) + 1) << width
+        if width > 0 and newest - end < 1 << (width + _SHARE_BITS):
+            width -= 1
         slot = (width, stamp >> width)
-        if slot not in taken:
-            taken.add(slot)
+        if slot != last:
+            last = slot
             kept.append(index)
     return kept[-most:]
 

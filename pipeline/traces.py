@@ -62,8 +62,8 @@ def spread(stamps_ns: Sequence[int], most: int) -> list[int]:
     """Indices of ascending stamps that stay: the newest densely, one per sixteenth of the age further back.
 
     Time is cut at fixed places into slots, each made of two of half its length; the first stamp of a slot
-    stays. Slots join when all of the longer one is old enough for its length, so that they only ever grow, and
-    thinning again and again keeps what thinning at once would.
+    stays. Slots join when all of the longer one is old enough for its length, so that they only ever grow,
+    and thinning again and again keeps what thinning at once would.
     """
     newest = stamps_ns[-1]
     kept: list[int] = []

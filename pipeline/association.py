@@ -7,6 +7,7 @@ dropped: a missing line widens the answer, a wrong one bends it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,11 @@ OUTERMOST = 1e6
 MOST_CLOUD_LINES, MOST_IMAGE_LINES = 100, 400
 """Lines of one class that are paired, the longest: a street has fewer, a broken mask makes thousands. Bounds
 time and memory."""
+MOST_TOGETHER = 20_000
+"""Pairs of several frames that are compared at once: beyond it memory grows and time is no longer saved."""
+
+FrameLines: TypeAlias = tuple[Sequence[CloudLine], Sequence[ImageLine]]
+"""Lines of one frame in cloud and image."""
 
 
 _NODES = 0.5 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * 0.5 / np.sqrt(3.0)
@@ -79,24 +85,78 @@ def associate(
     Returns:
         The pairs; none is an ordinary answer.
     """
-    rows, candidates = pairs_on_overlap(cloud_lines, image_lines, camera, T_cam_lidar)
-    if len(rows) == 0:
-        return Association((), NO_PAIRS)
-    cost = np.full((len(cloud_lines), len(image_lines)), np.inf)
+    return associate_all([(cloud_lines, image_lines)], camera, T_cam_lidar, covariance)[0]
+
+
+def associate_all(
+    frames: Sequence[FrameLines], camera: CameraModel, T_cam_lidar: Floats, covariance: Floats
+) -> list[Association]:
+    """:func:`associate` for several frames, which costs little more than for one."""
+    found: list[Association] = []
+    comparable = [_comparable(*frame) for frame in frames]
+    begin = 0
+    while begin < len(frames):
+        end, pairs = begin + 1, len(comparable[begin])
+        while end < len(frames) and pairs + len(comparable[end]) <= MOST_TOGETHER:
+            pairs += len(comparable[end])
+            end += 1
+        together = frames[begin:end], comparable[begin:end]
+        found += _associated(*together, camera, T_cam_lidar, covariance)
+        begin = end
+    return found
+
+
+def _associated(
+    frames: Sequence[FrameLines],
+    comparable: Sequence[NDArray[np.int64]],
+    camera: CameraModel,
+    T_cam_lidar: Floats,
+    covariance: Floats,
+) -> list[Association]:
+    """The pairs of a few frames, of those that are comparable."""
+    first = np.cumsum([(0, 0), *((len(cloud), len(image)) for cloud, image in frames)], axis=0)[:-1]
+    frame = np.repeat(np.arange(len(frames)), [len(rows) for rows in comparable])
+    rows = np.concatenate(comparable)
+    enough, candidates = _on_overlap(
+        [line for cloud, _ in frames for line in cloud],
+        [line for _, image in frames for line in image],
+        rows + first[frame],
+        camera,
+        T_cam_lidar,
+    )
+    if len(candidates) == 0:
+        return [Association((), NO_PAIRS)] * len(frames)
+    rows, frame = rows[enough], frame[enough]
     unit = max(1.0, float(camera.K[1, 1]) / REFERENCE_FOCAL_PX)
     r = plk.residuals(candidates, camera.K, T_cam_lidar)
     foretold = _foretold(candidates, camera, T_cam_lidar, covariance)
-    cost[rows[:, 0], rows[:, 1]] = _costs(r, candidates.covariance + foretold)
+    cost = _costs(r, candidates.covariance + foretold)
+    sharp = np.linalg.eigvalsh(foretold)[:, 1] <= (STRUCTURE_REACH_PX * unit) ** 2
+    found = []
+    for k, (cloud_lines, image_lines) in enumerate(frames):
+        own = np.flatnonzero(frame == k)
+        chosen = own[_chosen((cloud_lines, image_lines), rows[own], cost[own], sharp[own], unit)]
+        matches = tuple(LineMatch(cloud_lines[i], image_lines[j]) for i, j in rows[chosen].tolist())
+        found.append(Association(matches, plk.select(candidates, chosen)))
+    return found
+
+
+def _chosen(
+    lines: FrameLines, rows: NDArray[np.int64], costs: Floats, sharp: NDArray[np.bool_], unit: float
+) -> NDArray[np.bool_]:
+    """Which candidates (M,2) of one frame are accepted, by their costs (M,); ``sharp``: well foretold."""
+    cloud_lines, image_lines = lines
+    cost = np.full((len(cloud_lines), len(image_lines)), np.inf)
+    cost[rows[:, 0], rows[:, 1]] = costs
     # Of each image line only the best pair may win; the rest is asked of these few alone.
-    best, second = (np.partition(np.vstack([cost, np.full(cost.shape[1], np.inf)]), 1, axis=0))[:2]
+    best, second = (np.partition(np.vstack([cost, np.full((2, cost.shape[1]), np.inf)]), 1, axis=0))[:2]
     ahead = (cost <= best) & np.isfinite(cost) & (cost + MARGIN <= second)
     chosen = np.array(
-        [bool(ahead[i, j]) and _wins(cost, image_lines, (i, j), unit) for i, j in rows.tolist()]
+        [bool(ahead[i, j]) and _wins(cost, image_lines, (i, j), unit) for i, j in rows.tolist()],
+        dtype=np.bool_,
     )
-    structure = np.array([cloud_lines[i].label == "structure" for i in rows[:, 0].tolist()])
-    chosen &= ~structure | (np.linalg.eigvalsh(foretold)[:, 1] <= (STRUCTURE_REACH_PX * unit) ** 2)
-    matches = tuple(LineMatch(cloud_lines[i], image_lines[j]) for i, j in rows[chosen].tolist())
-    return Association(matches, plk.select(candidates, chosen))
+    structure = np.array([cloud_lines[i].label == "structure" for i in rows[:, 0].tolist()], dtype=np.bool_)
+    return np.asarray(chosen & (~structure | sharp))
 
 
 NO_PAIRS = plk.LinePairs(
@@ -162,26 +222,37 @@ def pairs_on_overlap(
     Returns:
         Indices (M,2) of cloud and image line, and the M pairs.
     """
+    rows = _comparable(cloud_lines, image_lines)
+    enough, pairs = _on_overlap(cloud_lines, image_lines, rows, camera, T_cam_lidar)
+    return rows[enough], pairs
+
+
+def _comparable(cloud_lines: Sequence[CloudLine], image_lines: Sequence[ImageLine]) -> NDArray[np.int64]:
+    """Indices (M,2) of the pairs of one class, of the longest lines of one frame."""
     some_cloud = _longest(
         cloud_lines, [abs(a.sigma_m) + abs(a.mean_m or 0.0) for a in cloud_lines], MOST_CLOUD_LINES
     )
     some_image = _longest(image_lines, [b.sigma_px for b in image_lines], MOST_IMAGE_LINES)
-    pairs_of = np.array(
-        [
-            (i, j)
-            for i, a in enumerate(some_cloud)
-            for j, b in enumerate(some_image)
-            if cloud_lines[a].label == image_lines[b].label
-        ],
-        dtype=np.int64,
-    ).reshape(-1, 2)
-    if len(pairs_of) == 0:
-        return pairs_of, NO_PAIRS
-    rows = np.column_stack([np.array(some_cloud)[pairs_of[:, 0]], np.array(some_image)[pairs_of[:, 1]]])
-    cloud = _seen_parts([cloud_lines[i] for i in some_cloud], camera, T_cam_lidar).take(pairs_of[:, 0])
-    image = [image_lines[j] for j in rows[:, 1]]
-    start = np.stack([line.start for line in image])
-    along = np.stack([line.end for line in image]) - start
+    pairs = [(i, j) for i in some_cloud for j in some_image if cloud_lines[i].label == image_lines[j].label]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _on_overlap(
+    cloud_lines: Sequence[CloudLine],
+    image_lines: Sequence[ImageLine],
+    rows: NDArray[np.int64],
+    camera: CameraModel,
+    T_cam_lidar: Floats,
+) -> tuple[NDArray[np.bool_], plk.LinePairs]:
+    """Which of the pairs (M,2) have enough in common, and these, cut to it: see :func:`pairs_on_overlap`."""
+    if len(rows) == 0:
+        return np.zeros(0, dtype=np.bool_), NO_PAIRS
+    some_cloud, of_cloud = np.unique(rows[:, 0], return_inverse=True)
+    some_image, of_image = np.unique(rows[:, 1], return_inverse=True)
+    cloud = _seen_parts([cloud_lines[i] for i in some_cloud.tolist()], camera, T_cam_lidar).take(of_cloud)
+    image = [image_lines[j] for j in some_image.tolist()]
+    start = np.stack([line.start for line in image])[of_image]
+    along = np.stack([line.end for line in image])[of_image] - start
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = along / length
     tau = np.einsum("nki,ni->nk", cloud.uv - start[:, None], along)
@@ -196,7 +267,7 @@ def pairs_on_overlap(
     arm = cloud.first[:, None] + cloud.length[:, None] * share * z / cloud.depth[:, 1:]
     powers = np.stack([np.ones_like(arm), arm, arm**2], axis=2)
     fit = powers @ cloud.course @ powers.transpose(0, 2, 1)
-    sigma_px = np.array([line.sigma_px for line in image])
+    sigma_px = np.array([line.sigma_px for line in image])[of_image]
     own = place / length
     weight = np.stack([1.0 - own, own], axis=2)
     noise = sigma_px[:, None, None] ** 2 * (weight @ weight.transpose(0, 2, 1)) + (cloud.kappa**2)[
@@ -211,7 +282,7 @@ def pairs_on_overlap(
         start + place[:, 1:] * along,
         noise,
     )
-    return rows[enough], plk.select(pairs, enough)
+    return enough, plk.select(pairs, enough)
 
 
 def _longest(lines: Sequence[CloudLine | ImageLine], figures: Sequence[float], most: int) -> list[int]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from pipeline import line_doubt, plk, se3
-from pipeline.association import NO_PAIRS, Association, associate
+from pipeline.association import NO_PAIRS, Association, associate_all
 from pipeline.cameras import limit_of, undistort
 from pipeline.cloud_lanes import find_lanes
 from pipeline.cloud_poles import find_poles
@@ -210,8 +210,9 @@ def solve_lines(
     T = T_stored
     covariance = np.diag(prior_sigma**2)
     result = _silence(len(frames))
+    lines = [(frame.cloud_lines, frame.image_lines) for frame in frames]
     for _ in range(ROUNDS):
-        found = [associate(frame.cloud_lines, frame.image_lines, camera, T, covariance) for frame in frames]
+        found = associate_all(lines, camera, T, covariance)
         pairs = plk.stack([part.pairs for part in found] or [NO_PAIRS])
         if len(pairs) == 0:
             return _silence(len(frames))

@@ -111,8 +111,8 @@ def stack(parts: Sequence[LinePairs]) -> LinePairs:
     )
 
 
-def select(pairs: LinePairs, chosen: NDArray[np.bool_]) -> LinePairs:
-    """The pairs for which ``chosen`` (N,) holds."""
+def select(pairs: LinePairs, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> LinePairs:
+    """The pairs for which ``chosen`` (N,) holds, or those with these indices."""
     return LinePairs(
         pairs.start[chosen],
         pairs.end[chosen],

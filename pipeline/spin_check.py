@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.deskew import Twist
 from pipeline.motion import (
     LONGEST_S,
     TELLING_M_S,
@@ -32,7 +31,7 @@ def told_spin(
         sweep_s: Duration of a turn, s; None: the time from one sweep to the next.
         axis: float64 (3,), unit, LiDAR frame: the spin axis, upwards.
     """
-    start: Twist | None = None
+    start = None
     found, planes = [], [(stamp_ns, surfels(cloud)) for stamp_ns, cloud in sweeps]
     for (before_ns, before), (now_ns, now) in zip(planes, planes[_APART:], strict=False):
         seconds = (now_ns - before_ns) / 1e9

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline import plk, se3
-from pipeline.association import associate, pairs_on_overlap
+from pipeline.association import associate, associate_all, pairs_on_overlap
 from pipeline.records import CloudLine, ImageLine
 
 _spec = importlib.util.spec_from_file_location(
@@ -48,6 +48,21 @@ def test_all_pairs_are_found_near_the_truth():
     association = associate(cloud, image, scenes.CAMERA, scenes.TRUTH, TIGHT)
     assert sorted(indices(association, cloud, image)) == [(k, k) for k in range(8)]
     assert len(association.pairs) == 8
+
+
+@pytest.mark.parametrize("together", [1, 40, 20_000])
+def test_frames_together_give_what_each_gives_alone(monkeypatch, together):
+    monkeypatch.setattr("pipeline.association.MOST_TOGETHER", together)
+    sets = [scenes.line_sets(np.random.default_rng(seed)) for seed in range(5)]
+    frames = [sets[0], ([], []), *sets[1:3], (sets[3][0], []), ([], sets[3][1]), sets[4]]
+    found = associate_all(frames, scenes.CAMERA, scenes.TRUTH, TIGHT)
+    assert sum(len(one.matches) for one in found) > 20
+    for one, (cloud, image) in zip(found, frames, strict=True):
+        alone = associate(cloud, image, scenes.CAMERA, scenes.TRUTH, TIGHT)
+        assert indices(one, cloud, image) == indices(alone, cloud, image)
+        np.testing.assert_allclose(one.pairs.start, alone.pairs.start, rtol=1e-9)
+        np.testing.assert_allclose(one.pairs.covariance, alone.pairs.covariance, rtol=1e-9)
+    assert associate_all([], scenes.CAMERA, scenes.TRUTH, TIGHT) == []
 
 
 def test_lane_and_pole_are_never_paired():

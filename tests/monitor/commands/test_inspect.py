@@ -1,5 +1,6 @@
 """``calibwatch inspect`` on recordings whose content is known, and on the recordings of others."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -25,6 +26,7 @@ from monitor.messages.tf import encode_tf
 from pipeline.errors import CalibwatchError
 from pipeline.records import CameraImage, CameraModel, PointCloud
 from pipeline.se3 import inverse, transform
+from tests import drives
 
 DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[4] / "shared/data"))
 recordings = pytest.mark.skipif(not DATA.is_dir(), reason="no recordings folder (CALIBWATCH_DATA)")
@@ -218,6 +220,24 @@ def test_a_rig_file_is_obeyed_and_completed(path, tmp_path):
     assert "extrinsic from tf" in pair.how
     assert pair.pairs == 0
     assert topic(inspect(recording, rig), "/cam/image/compressed").image.reading.startswith("P:")
+
+
+@pytest.mark.parametrize(("spin", "times", "warned"), [("ccw", 0, 1), ("cw", 0, 0), ("ccw", 1, 0)])
+def test_a_wrong_sense_of_rotation_is_told(messages, tmp_path, spin, times, warned):
+    def without_times(message):
+        assert b"time\0" in message.data
+        return dataclasses.replace(message, data=message.data.replace(b"time\0", b"tame\0"))
+
+    stream = drives.first_frames(messages, 5)
+    if not times:
+        stream = drives.changed(stream, drives.CLOUD_TOPIC, without_times)
+    recording, rig = str(drives.write(tmp_path / "turning.mcap", stream)), tmp_path / "rig.toml"
+    rig.write_text(f'[[pairs]]\nname = "front"\n[pairs.lidar]\nspin = "{spin}"\n')
+    found = inspect(recording, rig)
+    assert len(found.pairs[0].warnings) == warned
+    told = [line for line in _lines(found) if "warning:" in line]
+    assert len(told) == warned
+    assert all("set lidar.spin to 'cw'" in line for line in told)
 
 
 def test_a_cut_recording_tells_how_much_was_read(path):

@@ -52,17 +52,12 @@ class Lookout:
         self._there = False
         self._lost = False
         self._end, other = link()
+        self._process: subprocess.Popen[bytes] | None = None
         with other:
-            self._process = subprocess.Popen(  # noqa: S603 - this very interpreter
-                [sys.executable, "-c", f"from {__name__} import main; main()", str(other.fileno())],
-                pass_fds=[other.fileno()],
-                # It finds what this process has found, and a terminal's interrupt is not for it.
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                start_new_session=True,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
+            try:
+                self._process = _started(other)
+            except OSError:
+                self._lost = True
         self._tell(dict(equipment), {})
 
     def ready(self) -> bool:
@@ -94,8 +89,9 @@ class Lookout:
     def close(self) -> None:
         """Ends it."""
         self._end.close()
-        self._process.kill()
-        self._process.wait()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
 
     def _tell(self, value: object, known: Mapping[str, object]) -> None:
         if self._lost:
@@ -113,6 +109,20 @@ class Lookout:
         except (EOFError, OSError):
             self._lost = True
             return None
+
+
+def _started(end: socket.socket) -> "subprocess.Popen[bytes]":
+    """The process, with its end of the link."""
+    return subprocess.Popen(  # noqa: S603 - this very interpreter
+        [sys.executable, "-c", f"from {__name__} import main; main()", str(end.fileno())],
+        pass_fds=[end.fileno()],
+        # It finds what this process has found, and a terminal's interrupt is not for it.
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        start_new_session=True,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
 
 
 def main() -> None:

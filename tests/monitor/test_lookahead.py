@@ -162,6 +162,19 @@ def test_a_process_that_dies_is_done_without(rig, messages, looked_at, monkeypat
     assert 2 < len(looked_at) < alone
 
 
+def test_a_process_that_can_not_be_started_is_done_without(rig, messages, looked_at, monkeypatch):
+    stream = stories(messages)["in order"]
+    plainly = told_of(rig, stream, 0)
+    alone = len(looked_at)
+
+    def refused(*_, **__):
+        raise BlockingIOError
+
+    monkeypatch.setattr("monitor.lookout.subprocess.Popen", refused)
+    assert told_of(rig, stream, 5) == plainly
+    assert len(looked_at) == 2 * alone
+
+
 def test_what_a_process_fails_at_is_met_here(rig, messages, looked_at, monkeypatch):
     stream = stories(messages)["in order"]
     plainly = told_of(rig, stream, 0)

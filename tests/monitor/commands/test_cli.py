@@ -48,7 +48,8 @@ def test_what_shows_nothing_does_not_load_the_viewer(command, cut):
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("reply", "did you mean 'replay'?"), ("zzz", "known: acknowledge, baseline, calibrate, demo,")]
+    ("name", "told"),
+    [("reply", "did you mean 'replay'?"), ("zzz", "known: acknowledge, baseline, calibrate, demo,")],
 )
 def test_an_unknown_command_names_the_nearest(calibwatch, name, told):
     code, _, err = calibwatch(name)

@@ -106,12 +106,12 @@ def heeded(
         xi: float64 (6,), what is believed, against the expected extrinsic.
         parameters: See there.
     """
+    responses = (*alertness.responses, (stamp_ns, response))[-parameters.before - parameters.newest :]
     if alertness.since_ns is not None:
         if stamp_ns - alertness.since_ns <= parameters.open_ns:
-            return dataclasses.replace(alertness, after=alertness.after + 1)
+            return dataclasses.replace(alertness, responses=responses, after=alertness.after + 1)
         # What is believed has changed since then, and with it what a response is compared with.
-        alertness = Alertness()
-    responses = (*alertness.responses, (stamp_ns, response))[-parameters.before - parameters.newest :]
+        responses = ((stamp_ns, response),)
     count = len(responses) - parameters.newest
     if count < parameters.least_before:
         return Alertness(responses)
@@ -201,7 +201,8 @@ def weighed(
     if shock is None:
         return alertness
     if shock.statistic < 0.5 * _level(budget):
-        return Alertness()
+        # The responses stay: a step may have come just after what was taken for one.
+        return Alertness(alertness.responses)
     found = alertness.found + 1 if believed(shock, budget, parameters) else 0
     return dataclasses.replace(alertness, found=found)
 

@@ -219,7 +219,7 @@ def advance(
     code, reason = _suspicion(judgement, steady, limits)
     if reason:
         return _enter(memory, code, reason, now_ns)
-    return _quiet(memory, judgement, now_ns, required, parameters)
+    return _quiet(memory, judgement, now_ns, required, limits, parameters)
 
 
 def _confirmed(
@@ -260,6 +260,7 @@ def _quiet(
     judgement: Judgement,
     now_ns: int,
     required: tuple[str, ...],
+    limits: Floats,
     parameters: VerdictParameters,
 ) -> Memory:
     """The state after a judgement without suspicion."""
@@ -273,7 +274,10 @@ def _quiet(
         reason = _unmonitored_reason(judgement, [a for a in wanted if a not in monitored])
         keep = patient and memory.state in ("starting", "healthy")
         return memory if keep else _enter(memory, "axes_not_monitored", reason, now_ns)
-    doubtful = [axis for axis in wanted if not judgement.excluded[axis]]
+    beyond = judgement.observable & (np.abs(judgement.drift) > limits)
+    doubtful = [
+        axis for axis in range(len(AXES)) if beyond[axis] or (axis in wanted and not judgement.excluded[axis])
+    ]
     if doubtful:
         names = " and ".join(_size(judgement, axis) for axis in doubtful)
         reason = f"{names} may exceed its limit, but lies within the stored extrinsic's own uncertainty."

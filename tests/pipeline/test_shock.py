@@ -148,6 +148,15 @@ def test_responses_that_fall_together_open_the_search_at_the_first_of_them():
     assert heard([0.24] * 11).since_ns is None
 
 
+def test_a_step_just_after_what_was_taken_for_one_is_sought_too():
+    opened = heard([*CALM, 0.27, 0.27, 0.27, 0.30, 0.31])
+    assert opened.since_ns == len(CALM) * TENTH
+    far = shock.Shock(ZERO, np.eye(6), statistic=3.0, lost=0.0, preference=0.0, before_ns=0, since_ns=1)
+    let_go = weighed(opened, far, BUDGET, P)
+    assert let_go.since_ns is None
+    assert heard([0.22, 0.23, 0.22], let_go, begin=13).since_ns == 13 * TENTH
+
+
 def test_a_step_soon_after_the_beginning_opens_the_search_too():
     assert heard([*CALM[:5], 0.25, 0.24, 0.25]).since_ns == 5 * TENTH
     assert heard([*CALM[:4], 0.25, 0.24, 0.25]).since_ns is None

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import typing
 
@@ -360,6 +361,15 @@ def test_only_required_axes_are_asked_and_only_excluded_ones_named():
     assert after(start(0), UNMONITORED, S, required=("pitch",)).state == "healthy"
     assert after(start(0), DOUBTFUL, S, required=("pitch",)).state == "healthy"
     assert after(start(0), QUIET, S, required=()).state != "healthy"
+
+
+def test_an_axis_nobody_requires_is_not_healthy_with_an_estimate_beyond_its_limit():
+    ahead = dataclasses.replace(QUIET, drift=0.24 * np.eye(6)[3])
+    memory = walked(ahead)
+    assert (memory.state, memory.code) == ("suspect", "within_stored_uncertainty")
+    assert memory.reason.startswith("forward +0.240 m")
+    unseen = dataclasses.replace(ahead, observable=np.array([a != "forward" for a in AXES]))
+    assert walked(unseen).state == "healthy"
 
 
 def test_axes_remember_when_they_were_last_seen():

@@ -57,7 +57,8 @@ class CauseParameters:
         zoom: Uncertainty of a sound focal length, as a share: 0.2 % is one px at the border of an image of
             1000 px, the blur of its gradients.
         rival: Misfit by which one cause must explain better than another to be preferred: chi-square, one
-            degree of freedom, at 1e-3, odds of two hundred to one.
+            degree of freedom, at 1e-3, odds of two hundred to one. Not enough to prefer the mount to a clock
+            that explains by itself.
         separable_sigmas: The time offset is separable when one that feigns a drift of an alert limit would
             stand out by so many sigma.
     """
@@ -147,6 +148,8 @@ class Explanation:
         if self.alone[best] > most[best]:
             return "cause_open"
         rivals = self.alone <= self.alone[best] + parameters.rival
+        # A claim on the mount is an alarm: it is made only where the clock by itself is excluded.
+        rivals[1] |= SOURCES[best] == "mount" and self.alone[1] <= parameters.single_alone
         named: dict[tuple[str, ...], Cause] = {
             ("mount",): "mount",
             ("clock",): "time_offset",

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from monitor.discovery import VEHICLE_FRAMES, Survey, compose, discover, path, survey_in
+from monitor.injection import inject
 from monitor.rig import (
     Rig,
     RigPair,
     bind,
     camera_from_info,
-    inject,
     is_cloud,
     is_image,
     load_rig,

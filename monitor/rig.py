@@ -30,9 +30,9 @@ from monitor.rig_document import (
 from monitor.sources import TopicInfo
 from pipeline.baseline import Baseline
 from pipeline.cameras import lens_of
-from pipeline.errors import CalibwatchError, InputError, RigError
-from pipeline.records import AXES, CameraModel, Floats
-from pipeline.se3 import orthonormalised, stored_before
+from pipeline.errors import InputError, RigError
+from pipeline.records import CameraModel, Floats
+from pipeline.se3 import orthonormalised
 
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", "foxglove.PointCloud")
 """Types that carry a sweep; folders give ``file/<suffix>``."""
@@ -393,49 +393,3 @@ def camera_from_info(info: CameraInfo, *, rectified: bool | None, topic: str) ->
     if not info.raw.D.any() and info.rectified is not None and np.allclose(info.raw.K, info.rectified.K):
         return info.raw, "K without distortion: D is zero and P holds the same K"
     return info.raw, "K and D: nothing says that the images are rectified"
-
-
-def parse_inject(text: str) -> Floats:
-    """``yaw=0.5,up=0.05`` (degrees, metres) as drift (6,): roll, pitch, yaw rad, forward, left, up m.
-
-    Raises:
-        RigError: An axis is unknown or given twice, or a value is no finite number.
-    """
-    drift = np.zeros(6)
-    seen = set()
-    for item in text.split(","):
-        name, _, number = (part.strip() for part in item.partition("="))
-        if name not in AXES:
-            raise RigError(f"--inject knows no axis '{name}'", hint=nearest(name, AXES))
-        if name in seen:
-            raise RigError(f"--inject names {name} twice", hint="give each axis once")
-        seen.add(name)
-        try:
-            value = float(number)
-        except ValueError as error:
-            raise RigError(
-                f"--inject: '{number}' is no number for {name}", hint="as in yaw=0.5,up=0.05"
-            ) from error
-        if not math.isfinite(value):
-            raise RigError(f"--inject: {name} is {number}", hint="a finite number, as in yaw=0.5,up=0.05")
-        index = AXES.index(name)
-        drift[index] = math.radians(value) if index < 3 else value
-    return drift
-
-
-def inject(pair: RigPair, drift: Floats) -> RigPair:
-    """The pair, its stored extrinsic altered so that the true drift is ``drift`` (6,), rad, m (DESIGN 2).
-
-    Raises:
-        RigError: The pair has no extrinsic yet.
-    """
-    if pair.T_cam_lidar is None:
-        raise RigError(
-            f"pair {pair.name} has no extrinsic to alter", hint="give one in the rig file or by tf_static"
-        )
-    R_vehicle_lidar = None if pair.T_vehicle_lidar is None else pair.T_vehicle_lidar[:3, :3]
-    try:
-        stored = stored_before(pair.T_cam_lidar, drift, R_vehicle_lidar)
-    except CalibwatchError as error:
-        raise RigError(f"--inject: {error.what}", hint=error.hint) from error
-    return dataclasses.replace(pair, T_cam_lidar=stored)

@@ -14,11 +14,12 @@ import numpy as np
 
 from monitor.calibrating import Calibration, calibrate
 from monitor.daemon import mount_of
+from monitor.injection import inject
 from monitor.intake import Intake
 from monitor.messages import Message
 from monitor.model_file import model_bytes
 from monitor.preparation import prepare
-from monitor.rig import RigPair, inject
+from monitor.rig import RigPair
 from monitor.sources import open_source
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, FramePair

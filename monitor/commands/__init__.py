@@ -24,7 +24,7 @@ class DriftParameter(click.ParamType["Floats"]):
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> "Floats":
         """Drift (6,), rad and m; a misspelt axis is wrong usage."""
-        from monitor.rig import parse_inject  # noqa: PLC0415 - numpy is not needed for --help
+        from monitor.injection import parse_inject  # noqa: PLC0415 - numpy is not needed for --help
 
         try:
             return parse_inject(str(value))

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from monitor.baseline_file import BaselineDocument, document_of, read_baseline, with_baselines, write_baseline
 from monitor.baselining import described, learned_from
 from monitor.daemon import mount_of
-from monitor.rig import inject, load_rig, parse_rig
+from monitor.injection import inject
+from monitor.rig import load_rig, parse_rig
 from pipeline import se3
 from pipeline.baseline import learn
 from pipeline.drift_test import DriftTestParameters

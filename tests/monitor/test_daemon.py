@@ -8,10 +8,10 @@ import pytest
 
 from monitor.daemon import extrinsic_hash, mount_of, watch, watching
 from monitor.events import EndEvent, FrameEvent, ProposalEvent, StatusEvent
+from monitor.injection import parse_inject
 from monitor.messages import Message
 from monitor.outputs import Outputs
 from monitor.preparation import prepare
-from monitor.rig import parse_inject
 from monitor.sources import Losses, Tick
 from pipeline.errors import InputError, RigError
 from pipeline.parameters import Parameters

@@ -12,9 +12,9 @@ from monitor import live
 from monitor.bus import BusSettings, Origin, listening_at, open_session
 from monitor.clock import SystemClock
 from monitor.command_bus import acknowledge
+from monitor.injection import parse_inject
 from monitor.preparation import prepare
 from monitor.requests import Note
-from monitor.rig import parse_inject
 from pipeline.errors import RigError, TransportError
 from tests import drives
 from tests.drives import CLOUD_TOPIC, IMAGE_TOPIC, INFO_TOPIC, TF_TOPIC

@@ -10,13 +10,13 @@ import pytest
 
 from monitor.daemon import watch, watching
 from monitor.events import EndEvent, FrameEvent, ProposalEvent, StatusEvent
+from monitor.injection import parse_inject
 from monitor.intake import Intake
 from monitor.lookahead import arrivals
 from monitor.lookout import Lookout
 from monitor.messages import Message
 from monitor.outputs import Outputs
 from monitor.preparation import prepare
-from monitor.rig import parse_inject
 from monitor.sources import Losses, Tick
 from pipeline.errors import InputError
 from pipeline.frame_evidence import Scout

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from monitor.injection import parse_inject
 from monitor.messages import Message, Transform, decode
 from monitor.messages.tf import encode_tf
 from monitor.preparation import prepare
-from monitor.rig import parse_inject
 from pipeline.errors import InputError, RigError
 from pipeline.se3 import mount_drift, vehicle_axes
 from tests import drives

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from monitor import rig as rigs
 from monitor.messages import CameraInfo
-from monitor.rig import bind, camera_from_info, inject, load_rig, parse_inject, parse_rig
+from monitor.rig import bind, camera_from_info, load_rig, parse_rig
 from monitor.sources import TopicInfo
 from pipeline.errors import InputError, RigError
 from pipeline.records import AXES, CameraModel
-from pipeline.se3 import mount_drift, transform, vehicle_axes
+from pipeline.se3 import transform
 
 T = transform(Rotation.from_euler("xyz", [-1.2, 0.1, -1.5]).as_matrix(), np.array([0.1, -0.3, 0.2]))
 
@@ -272,42 +272,6 @@ def test_which_intrinsics_hold(raw, rectified, said, topic, focal, words):
 def test_a_rig_that_says_rectified_needs_a_projection():
     with pytest.raises(RigError, match="no P"):
         camera_from_info(CameraInfo(lens(50), None), rectified=True, topic="/a")
-
-
-def test_inject_reads_degrees_and_metres():
-    assert parse_inject("yaw=0.5, up=-0.05") == pytest.approx([0, 0, math.radians(0.5), 0, 0, -0.05])
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("jaw=1", "no axis 'jaw'.*did you mean 'yaw'"),
-        ("yaw", "'' is no number"),
-        ("yaw=much", "'much' is no number"),
-        ("yaw=nan", "yaw is nan"),
-        ("yaw=1,yaw=2", "yaw twice"),
-        ("", "no axis ''"),
-    ],
-)
-def test_inject_refuses(text, words):
-    with pytest.raises(RigError, match=words):
-        parse_inject(text)
-
-
-@given(st.lists(st.floats(-3, 3), min_size=6, max_size=6), st.booleans())
-def test_injected_drift_is_what_the_mount_then_drifted(values, with_vehicle):
-    drift = np.array([*np.radians(values[:3]), *(0.1 * np.array(values[3:]))])
-    T_vehicle_lidar = transform(Rotation.from_euler("z", 1.1).as_matrix(), np.ones(3))
-    extra = {"T_vehicle_lidar": T_vehicle_lidar.tolist()} if with_vehicle else {}
-    pair = parse_rig(document(extrinsic={"T_cam_lidar": T.tolist()}, **extra), where="x").pairs[0]
-    stored = inject(pair, drift).T_cam_lidar
-    R_vehicle_cam = vehicle_axes(stored, pair.T_vehicle_lidar)
-    assert mount_drift(stored, pair.T_cam_lidar, R_vehicle_cam) == pytest.approx(drift, abs=1e-9)
-
-
-def test_inject_needs_an_extrinsic():
-    with pytest.raises(RigError, match="no extrinsic to alter"):
-        inject(parse_rig(document(), where="x").pairs[0], np.zeros(6))
 
 
 def test_axes_are_those_of_the_records():

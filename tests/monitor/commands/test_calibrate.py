@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from monitor.injection import parse_inject
 from monitor.preparation import prepare
-from monitor.rig import parse_inject
 from pipeline.se3 import mount_drift, vehicle_axes
 from tests import drives
 from tests.drives import IMAGE_TOPIC, INFO_TOPIC

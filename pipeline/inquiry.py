@@ -76,6 +76,8 @@ class Inquiry:
         window = [Passage(frame, moves[frame.stamp_ns]) for frame in frames if frame.stamp_ns in moves]
         if belief.edges is None or judgement.blind or not window:
             return None
+        if steady is not None and steady.timed:
+            return _jumped(steady, window[-1].move)
         self._close(window, belief.edges.xi)
         if sudden and memory.severity is None:
             self._look_closer(window, belief.edges.xi)
@@ -186,6 +188,16 @@ REASONS = {
     "cause_open": "Mount, clock or lens has changed: the drive so far does not tell which.",
 }
 """What is said of each cause but the mount."""
+
+
+def _jumped(steady: Steady, move: Move) -> Doubt:
+    """Of a sudden move that a jump of the time between sweeps and images would feign (FORMULAS G1)."""
+    late_s = float(steady.drift @ move.motion) / max(float(move.motion @ move.motion), _SLOWEST**2)
+    return Doubt("forward_or_sync", REASONS["forward_or_sync"].format(alone=1e3 * late_s))
+
+
+_SLOWEST = 0.1
+"""m/s; below it no time offset is worth a figure."""
 
 
 def _told(cause: Cause, found: Explanation) -> Doubt:

@@ -21,6 +21,9 @@ from pipeline.edge_witness import EdgeBatch, EdgeFrame
 from pipeline.records import AXES, CameraModel, Floats
 from pipeline.run_length import AlarmBudget
 
+_STANDSTILL = 1e-6
+"""Squared drift, in sigmas, that a wrong time feigns; below it the vehicle stands and time moves nothing."""
+
 
 @dataclass(frozen=True, slots=True)
 class ShockParameters:
@@ -79,6 +82,8 @@ class Shock:
         covariance: float64 (6,6), of its random error, and of what a step of one sigma in the time between
             sweep and image would feign; nothing else is left in a difference.
         statistic: Squared step in sigmas, chi-square of six degrees without one.
+        apart: What is left of it when the time between sweep and image may have jumped instead, chi-square of
+            five degrees.
         lost: Share of its score that each side at least loses under the extrinsic of the other.
         preference: Standard errors by which the cells of each side at least prefer its own.
         before_ns: Stamp of the newest frame before it.
@@ -88,6 +93,7 @@ class Shock:
     xi: Floats
     covariance: Floats
     statistic: float
+    apart: float
     lost: float
     preference: float
     before_ns: int
@@ -166,12 +172,14 @@ def find_shock(
     covariance = _mean_covariance(old, T_old, settings) + _mean_covariance(new, T_new, settings)
     feigned = B.T @ np.mean([frame.feigned for frame in after], axis=0)
     covariance = covariance + np.outer(feigned, feigned)
+    statistic, apart = _with_time_free(step, covariance, feigned)
     sides = ((old, T_old, T_new), (new, T_new, T_old))
     own, other = zip(*((score_only(b, T, 0), score_only(b, T_off, 0)) for b, T, T_off in sides), strict=True)
     return Shock(
         xi=step,
         covariance=covariance,
-        statistic=float(step @ np.linalg.solve(covariance, step)),
+        statistic=statistic,
+        apart=apart,
         lost=min(
             1.0 - float(b.sum() / a.sum()) if a.sum() > 0 else 0.0 for a, b in zip(own, other, strict=True)
         ),
@@ -179,6 +187,19 @@ def find_shock(
         before_ns=before[-1].stamp_ns,
         since_ns=since_ns,
     )
+
+
+def _with_time_free(step: Floats, covariance: Floats, feigned: Floats) -> tuple[float, float]:
+    """Squared step in sigmas, and what is left of it when the time may have jumped.
+
+    Sweeps and images that suddenly come apart in time look like a step along the motion (FORMULAS G1).
+    """
+    statistic = float(step @ np.linalg.solve(covariance, step))
+    towards = np.linalg.solve(covariance, feigned)
+    length = float(feigned @ towards)
+    if length < _STANDSTILL:
+        return statistic, statistic
+    return statistic, statistic - float(towards @ step) ** 2 / length
 
 
 def _mean_covariance(batch: EdgeBatch, T_cam_lidar: Floats, settings: EdgeWitnessParameters) -> Floats:
@@ -213,6 +234,11 @@ def believed(shock: Shock, budget: AlarmBudget, parameters: ShockParameters) -> 
     return clear and shock.statistic > _level(budget)
 
 
+def moved(shock: Shock, budget: AlarmBudget) -> bool:
+    """Whether a step that is believed can not be one of the clocks."""
+    return shock.apart > _level(budget, len(AXES) - 1)
+
+
 @functools.lru_cache(maxsize=16)
-def _level(budget: AlarmBudget) -> float:
-    return float(chdtri(len(AXES), budget.yearly_alarms / budget.yearly_scenes))
+def _level(budget: AlarmBudget, degrees: int = len(AXES)) -> float:
+    return float(chdtri(degrees, budget.yearly_alarms / budget.yearly_scenes))

@@ -10,7 +10,7 @@ from pipeline.edge_score import EdgeFrame, batch_of, mean_responses
 from pipeline.mount import Mount
 from pipeline.onset import Onset
 from pipeline.parameters import Parameters
-from pipeline.shock import Alertness, find_shock, heeded, weighed
+from pipeline.shock import Alertness, find_shock, heeded, moved, weighed
 from pipeline.verdict import Steady
 
 
@@ -57,11 +57,13 @@ class StepSeeker:
         self._alertness = weighed(self._alertness, found, self._budget, self._parameters)
         if found is None or self._alertness.found < self._parameters.confirmations:
             return None
+        surely = moved(found, self._budget)
         return Steady(
-            alarming=True,
+            alarming=surely,
             suspicious=True,
             drift=B @ found.xi,
             sigma=np.sqrt(np.diag(B @ found.covariance @ B.T)),
             over=f"the last {(now_ns - found.since_ns) / 1e9:.1f} s",
             onset=Onset(found.since_ns, found.before_ns, found.since_ns),
+            timed=not surely,
         )

@@ -67,6 +67,7 @@ class Steady:
         sigma: float64 (6,), of it, the floor between scenes included.
         over: What it was heard over: ``12 scenes``, ``the last 0.6 s``.
         onset: When it began.
+        timed: A jump of the time between sweeps and images would look the same.
     """
 
     alarming: bool
@@ -75,6 +76,7 @@ class Steady:
     sigma: Floats
     over: str
     onset: Onset
+    timed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

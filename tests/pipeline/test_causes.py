@@ -172,6 +172,26 @@ def test_a_moved_mount_is_named_unless_it_looks_like_a_delay(axis, motions):
     assert not found.changed("lens", P)
 
 
+def explained(alone, needed=(0.0, 0.0, 0.0)):
+    """An explanation with the misfits given, of evidence that nothing sound explains."""
+    found = told([section(driven(10.0), np.zeros(8))])
+    return dataclasses.replace(found, alone=np.array(alone), needed=np.array(needed), unexplained=400.0)
+
+
+@pytest.mark.parametrize(
+    ("alone", "named"),
+    [
+        # One section of a wide step ahead: the mount fits better by 11, and the clock well enough.
+        ((1.0, 12.7, 270.0), "forward_or_sync"),
+        ((1.0, 29.8, 270.0), "forward_or_sync"),
+        ((1.0, 30.0, 270.0), "mount"),
+        ((12.7, 1.0, 270.0), "time_offset"),
+    ],
+)
+def test_the_mount_is_blamed_only_where_the_clock_alone_is_excluded(alone, named):
+    assert explained(alone).cause(P) == named
+
+
 def test_a_mount_that_moved_while_the_clock_went_wrong_is_still_told():
     theta = only(CLOCK, 0.04) + only(2, math.radians(1.0))
     found = told([section(a, theta, 30 * ROAD) for a in AT_MANY_SPEEDS])

@@ -1,6 +1,7 @@
 import dataclasses
 import functools
 import math
+import re
 import typing
 
 import numpy as np
@@ -68,13 +69,13 @@ def mount_of(focal=1.0, drift=None):
     )
 
 
-def watched(frames=12, *, delay_ms=0, focal=1.0, drift=None, hertz=None):
+def watched(frames=12, *, delay_ms=0, delayed_from=0, focal=1.0, drift=None, hertz=None):
     """A watch that has seen the drive with stamps, lens, extrinsic or mount made wrong; its states."""
     pairs = drive(frames)
     mount = mount_of(focal, drift)
     watch, states = Watch(mount, Parameters(), None), []
-    for pair in pairs:
-        stamp_ns = pair.image_stamp_ns - delay_ms * 1_000_000
+    for number, pair in enumerate(pairs):
+        stamp_ns = pair.image_stamp_ns - (number >= delayed_from) * delay_ms * 1_000_000
         seen = pair if hertz is None else shaken(pair, hertz)
         watch.step(dataclasses.replace(seen, image_stamp_ns=stamp_ns))
         states.append(watch.memory.state)
@@ -99,6 +100,14 @@ def test_a_delay_is_no_drift():
     assert "ms" in watch.memory.reason
     found = watch.inquiry.explanation
     assert found.time_alone_s == pytest.approx(1e-3 * DELAY_MS, abs=0.01)
+
+
+def test_clocks_that_come_apart_on_the_way_are_no_drift():
+    watch, states = watched(20, delay_ms=DELAY_MS, delayed_from=12)
+    assert "drifted" not in states
+    assert (watch.memory.state, watch.memory.code) == ("suspect", "forward_or_sync")
+    told_ms = float(re.search(r"images ([+-]\d+) ms off", watch.memory.reason)[1])
+    assert told_ms == pytest.approx(DELAY_MS, abs=10.0)
 
 
 def test_another_focal_length_is_no_drift():

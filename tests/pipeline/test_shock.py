@@ -88,6 +88,25 @@ def test_a_step_that_a_clock_may_feign_is_not_believed(second):
     assert believed(aside, BUDGET, P)
 
 
+def test_what_is_left_of_a_step_is_its_least_over_all_time_offsets(second):
+    """Brute force over the offset, against the closed form."""
+    frames, mount = second
+    feigned = np.array([0.001, 0.0, 0.002, 0.05, 0.01, 0.0])
+    told = found([dataclasses.replace(f, feigned=feigned) for f in frames], mount, 0.1 * np.eye(6)[4])
+    B = se3.vehicle_block(mount.R_vehicle_cam)
+    offsets = np.linspace(-10.0, 10.0, 20_001)
+    left = (B @ told.xi)[:, None] - feigned[:, None] * offsets
+    P_inverse = np.linalg.inv(B @ told.covariance @ B.T)
+    least = np.einsum("in,ij,jn->n", left, P_inverse, left).min()
+    assert told.apart == pytest.approx(least, rel=1e-4)
+    assert told.apart < told.statistic
+
+
+def test_at_standstill_no_clock_can_feign_a_step(second):
+    told = found(*second, 0.1 * np.eye(6)[4])
+    assert told.apart == told.statistic
+
+
 def test_a_mount_that_lies_elsewhere_in_each_frame_is_known_the_less(second):
     frames, mount = second
     calm = found(frames, mount, ZERO)
@@ -111,7 +130,9 @@ def test_a_side_with_too_few_frames_or_with_other_objects_says_nothing(second):
     "change", [{"statistic": 45.0}, {"lost": 0.02}, {"preference": 1.9}], ids=["chance", "score", "cells"]
 )
 def test_each_doubt_alone_is_enough_not_to_believe_it(change):
-    sure = shock.Shock(ZERO, np.eye(6), statistic=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1)
+    sure = shock.Shock(
+        ZERO, np.eye(6), statistic=46.0, apart=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1
+    )
     assert stats.chi2.sf(46.0, 6) * BUDGET.yearly_scenes < BUDGET.yearly_alarms
     assert believed(sure, BUDGET, P)
     assert not believed(dataclasses.replace(sure, **change), BUDGET, P)
@@ -119,7 +140,9 @@ def test_each_doubt_alone_is_enough_not_to_believe_it(change):
 
 def test_a_step_is_sought_until_it_is_far_from_any_belief():
     opened = Alertness((), 1, 5, ZERO)
-    sure = shock.Shock(ZERO, np.eye(6), statistic=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1)
+    sure = shock.Shock(
+        ZERO, np.eye(6), statistic=46.0, apart=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1
+    )
     assert weighed(opened, None, BUDGET, P) is opened
     once = weighed(opened, sure, BUDGET, P)
     assert (once.found, once.since_ns) == (1, 1)
@@ -151,7 +174,9 @@ def test_responses_that_fall_together_open_the_search_at_the_first_of_them():
 def test_a_step_just_after_what_was_taken_for_one_is_sought_too():
     opened = heard([*CALM, 0.27, 0.27, 0.27, 0.30, 0.31])
     assert opened.since_ns == len(CALM) * TENTH
-    far = shock.Shock(ZERO, np.eye(6), statistic=3.0, lost=0.0, preference=0.0, before_ns=0, since_ns=1)
+    far = shock.Shock(
+        ZERO, np.eye(6), statistic=3.0, apart=3.0, lost=0.0, preference=0.0, before_ns=0, since_ns=1
+    )
     let_go = weighed(opened, far, BUDGET, P)
     assert let_go.since_ns is None
     assert heard([0.22, 0.23, 0.22], let_go, begin=13).since_ns == 13 * TENTH
@@ -203,6 +228,15 @@ def test_a_seeker_tells_a_step_at_the_second_judgement_that_finds_it(second):
     assert twice.onset.from_ns < twice.onset.stamp_ns == twice.onset.to_ns
     seeker.forget()
     assert not seeker.due
+
+
+def test_a_seeker_blames_the_mount_only_where_no_jump_of_the_clock_explains_the_step(second):
+    frames, mount = second
+    driven = [dataclasses.replace(frame, feigned=0.03 * np.eye(6)[3]) for frame in frames]
+    _, _, (_, ahead) = sought((driven, mount), 0.4 * np.eye(6)[3])
+    assert (ahead.alarming, ahead.suspicious, ahead.timed) == (False, True, True)
+    _, _, (_, aside) = sought((driven, mount), 0.2 * np.eye(6)[4])
+    assert (aside.alarming, aside.suspicious, aside.timed) == (True, True, False)
 
 
 def test_a_seeker_has_nothing_to_look_for_where_frames_respond_as_before(second):

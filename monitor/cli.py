@@ -3,13 +3,14 @@
 Commands are loaded when they are called, so that ``--help`` costs nothing.
 """
 
+import contextlib
 import importlib
 import logging
-import os
 import sys
 import traceback
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import NoReturn
 
 import click
 
@@ -65,6 +66,18 @@ class _Commands(click.Group):
             ctx.fail(f"no command '{args[0]}' ({nearest(args[0], sorted(COMMANDS))})")
         return super().resolve_command(ctx, args)
 
+    def invoke(self, ctx: click.Context) -> object:
+        """Runs the command; that a pipe between our own processes broke is not taken for a reader that left.
+
+        click ends the program silently, with 1, wherever a pipe breaks.
+        """
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            if not _while_telling(error):
+                raise RuntimeError("a pipe between processes of calibwatch broke") from error
+            raise
+
 
 @click.group(
     cls=_Commands,
@@ -93,24 +106,30 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         code = calibwatch.main(args=arguments, prog_name="calibwatch", standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        with contextlib.suppress(OSError):
+            error.show()
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
-        sys.exit(INTERRUPTED)
+        _end(INTERRUPTED, "interrupted")
     except CalibwatchError as error:
-        click.echo(f"calibwatch: {_one_line(str(error))}", err=True)
-        sys.exit(BAD_INPUT)
-    except BrokenPipeError:
-        # The reader of our output went away; nothing can be told to it any more.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(BAD_INPUT)
+        _end(BAD_INPUT, f"calibwatch: {_one_line(str(error))}")
     except Exception as error:  # noqa: BLE001 - the top of the program: reports and ends
-        click.echo(
-            f"calibwatch: internal error: {_one_line(repr(error))} (trace in {_trace_file()})", err=True
-        )
-        sys.exit(BAD_INPUT)
+        if isinstance(error, OSError) and _while_telling(error):
+            _end(BAD_INPUT, f"calibwatch: the output can not be written: {error.strerror}")
+        _end(BAD_INPUT, f"calibwatch: internal error: {_one_line(repr(error))} (trace in {_trace_file()})")
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _end(code: int, why: str) -> NoReturn:
+    """Says why on stderr, if anybody reads it, and ends."""
+    with contextlib.suppress(OSError):
+        click.echo(why, err=True)
+    sys.exit(code)
+
+
+def _while_telling(error: OSError) -> bool:
+    """Whether stdout or stderr failed: all that is told there goes through ``click.echo``."""
+    return any(frame.f_code is click.echo.__code__ for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
 def _one_line(text: str) -> str:

@@ -1,5 +1,6 @@
 """The command line as a whole: light to start, one line for what goes wrong, codes that scripts may trust."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +90,57 @@ def test_a_fault_of_ours_is_one_line_and_a_trace_that_can_be_sent(calibwatch, mo
     assert "raise error" in trace.read_text()
 
 
+def run_into(stream, *arguments, broken):
+    """Our program where nothing can be written to stdout or stderr: exit code, the other stream."""
+    other = "stderr" if stream == "stdout" else "stdout"
+    ran = subprocess.run(  # noqa: S603 - our own program
+        [sys.executable, "-c", "from monitor.cli import main; main()", *map(str, arguments)],
+        check=False,
+        text=True,
+        **{stream: broken, other: subprocess.PIPE},
+    )
+    return ran.returncode, getattr(ran, other)
+
+
+@pytest.fixture
+def left():
+    """The end to write to of a pipe whose reader has gone."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    yield writer
+    os.close(writer)
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("inspect",)], ids=" ".join)
+def test_a_reader_that_left_is_not_answered(left, cut, arguments):
+    recording = [cut(5)] if arguments == ("inspect",) else []
+    assert run_into("stdout", *arguments, *recording, broken=left) == (1, "")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(("replay",), 2), (("inspect", "absent"), 1)])
+def test_the_code_stands_where_nobody_reads_why(left, arguments, code):
+    assert run_into("stderr", *arguments, broken=left) == (code, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("arguments", [("--help",), ("inspect",)], ids=" ".join)
+def test_output_that_finds_no_room_is_one_line(cut, arguments):
+    recording = [cut(5)] if arguments == ("inspect",) else []
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        code, err = run_into("stdout", *arguments, *recording, broken=full)
+    assert code == 1
+    assert err.splitlines() == ["calibwatch: the output can not be written: No space left on device"]
+
+
+def test_a_pipe_that_breaks_inside_is_a_fault_of_ours(calibwatch, monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    failing(monkeypatch, BrokenPipeError(32, "Broken pipe"))
+    code, _, err = calibwatch("inspect")
+    assert code == 1
+    assert "internal error" in err
+    assert "Broken pipe" in Path(err.partition("trace in ")[2].rstrip(")\n")).read_text()
+
+
 def test_an_interrupt_is_130(calibwatch, monkeypatch):
     failing(monkeypatch, KeyboardInterrupt())
     code, out, err = calibwatch("inspect")
@@ -104,8 +156,7 @@ def test_only_healthy_reads_zero(state):
 
 
 def test_a_signal_sets_the_stop_and_the_second_interrupts():
-    import os  # noqa: PLC0415 - signals are sent here only
-    import signal  # noqa: PLC0415 - likewise
+    import signal  # noqa: PLC0415 - signals are sent here only
 
     before = signal.getsignal(signal.SIGTERM)
     with commands.stop_on_signal() as stop:

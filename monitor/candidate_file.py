@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, ValidationError
+from pydantic import Field, FiniteFloat, NonNegativeInt, ValidationError
 
+from monitor.document import DocumentPart
 from monitor.statements import TO_PEOPLE, Identity
 from monitor.status import AxisValues, Name, NonNegative, Provenance
 from pipeline import se3
@@ -33,18 +34,7 @@ Row6 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, Fi
 Chance = Annotated[FiniteFloat, Field(ge=0, le=1)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        allow_inf_nan=False,
-        validate_by_name=True,
-        serialize_by_alias=True,
-        json_schema_serialization_defaults_required=True,
-    )
-
-
-class CandidateWindow(_Part):
+class CandidateWindow(DocumentPart):
     """One window that the candidate was made from; no two show the same objects."""
 
     from_ns: int
@@ -54,7 +44,7 @@ class CandidateWindow(_Part):
     frames: NonNegativeInt
 
 
-class HoldOutResult(_Part):
+class HoldOutResult(DocumentPart):
     """The candidate against frames that it was not made from."""
 
     from_ns: int
@@ -78,7 +68,7 @@ class HoldOutResult(_Part):
     lines_candidate: NonNegative | None
 
 
-class CandidateDocument(_Part):
+class CandidateDocument(DocumentPart):
     """A proposed extrinsic of one pair: for a person to accept, never applied by itself."""
 
     schema_: Literal["calibwatch.candidate/1"] = Field(default=SCHEMA, alias="schema")

@@ -8,7 +8,9 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal, TypeAlias, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, StringConstraints
+from pydantic import Field, FiniteFloat, NonNegativeInt, StringConstraints
+
+from monitor.document import DocumentPart
 
 SCHEMA: Literal["calibwatch.status/1"] = "calibwatch.status/1"
 
@@ -74,18 +76,7 @@ def exit_code(state: State) -> int:
     return EXIT_CODES[state]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        allow_inf_nan=False,
-        validate_by_name=True,
-        serialize_by_alias=True,
-        json_schema_serialization_defaults_required=True,
-    )
-
-
-class Onset(_Part):
+class Onset(DocumentPart):
     """Since when the drift is there: most likely stamp and interval."""
 
     stamp_ns: int = Field(description="most likely; from_ns where nothing before was surely free of it")
@@ -94,7 +85,7 @@ class Onset(_Part):
     gradual: bool = Field(default=False, description="it grew rather than jumped; the first growth is told")
 
 
-class AxisDrift(_Part):
+class AxisDrift(DocumentPart):
     """Drift along one axis. Degrees for roll, pitch, yaw; metres for forward, left, up."""
 
     value: FiniteFloat | None = Field(description="estimated drift; null while nothing is known")
@@ -113,7 +104,7 @@ class AxisDrift(_Part):
     last_seen_ns: int | None = Field(description="stamp at which the axis was last observable")
 
 
-class Drift(_Part):
+class Drift(DocumentPart):
     """Motion of the camera mount since the extrinsic was stored.
 
     Signs: +yaw turns left, +pitch nose down, +roll right side down; forward, left, up of the camera centre.
@@ -142,7 +133,7 @@ class Drift(_Part):
         return axis
 
 
-class Consequence(_Part):
+class Consequence(DocumentPart):
     """What the drift does at one distance from the camera; null where nothing projects."""
 
     range_m: NonNegative
@@ -157,7 +148,7 @@ class Consequence(_Part):
     sigma_up_m: NonNegative
 
 
-class AxisValues(_Part):
+class AxisValues(DocumentPart):
     """One number per axis, degrees and metres."""
 
     roll: FiniteFloat | None
@@ -168,7 +159,7 @@ class AxisValues(_Part):
     up: FiniteFloat | None
 
 
-class Witness(_Part):
+class Witness(DocumentPart):
     """What one witness alone says."""
 
     drift: AxisValues
@@ -177,14 +168,14 @@ class Witness(_Part):
     frames: NonNegativeInt
 
 
-class Witnesses(_Part):
+class Witnesses(DocumentPart):
     """The two witnesses; null where one has said nothing."""
 
     lines: Witness | None
     edges: Witness | None
 
 
-class Drive(_Part):
+class Drive(DocumentPart):
     """Where the mount is by all scenes of the drive, a wandering one followed."""
 
     scenes: NonNegativeInt = Field(description="stretches of road that share no frame, heard so far")
@@ -192,7 +183,7 @@ class Drive(_Part):
     sigma: AxisValues = Field(description="standard deviation, what scenes differ by included")
 
 
-class Window(_Part):
+class Window(DocumentPart):
     """Evidence on which the present verdict rests."""
 
     frames: NonNegativeInt
@@ -206,7 +197,7 @@ class Window(_Part):
     )
 
 
-class Frames(_Part):
+class Frames(DocumentPart):
     """The account of every frame since the start: received = used + dropped + under way."""
 
     received: NonNegativeInt
@@ -214,7 +205,7 @@ class Frames(_Part):
     dropped: dict[Code, NonNegativeInt] = Field(description="reason -> number")
 
 
-class Rates(_Part):
+class Rates(DocumentPart):
     """Rates of the inputs and of the two witnesses, over the window."""
 
     lidar_hz: NonNegative | None
@@ -224,7 +215,7 @@ class Rates(_Part):
     edges_hz: NonNegative | None = Field(default=None, description="frames that got edges")
 
 
-class TimeOffset(_Part):
+class TimeOffset(DocumentPart):
     """Offset between the clocks of the two sensors."""
 
     ms: FiniteFloat | None = Field(
@@ -234,21 +225,21 @@ class TimeOffset(_Part):
     separable: bool = Field(description="the motion allows telling it from yaw and forward drift")
 
 
-class Timing(_Part):
+class Timing(DocumentPart):
     """Quantiles of the time one stage takes, ms."""
 
     p50: NonNegative
     p95: NonNegative
 
 
-class Provenance(_Part):
+class Provenance(DocumentPart):
     """Which extrinsic or model: content hash and version; null where there is none."""
 
     hash: str | None
     version: str | None
 
 
-class Status(_Part):
+class Status(DocumentPart):
     """One status of one pair: once a second, and at each change."""
 
     schema_: Literal["calibwatch.status/1"] = Field(default=SCHEMA, alias="schema")

@@ -137,6 +137,36 @@ def output_options(function: Callable[..., object]) -> Callable[..., object]:
     )(function)
 
 
+def runs_option(runs: int, of: str) -> Callable[[Callable[..., object]], Callable[..., object]]:
+    """``--runs`` of experiments: so many by default, of what ``of`` says."""
+    return click.option(
+        "--runs", type=click.IntRange(1, 100_000), default=runs, show_default=True, help=f"Runs of {of}."
+    )
+
+
+def simulated_option(what: str) -> Callable[[Callable[..., object]], Callable[..., object]]:
+    """``--simulated N`` of experiments: ``what`` of simulated streets."""
+    return click.option(
+        "--simulated",
+        metavar="N",
+        type=click.IntRange(0, 100_000),
+        default=0,
+        help=f"{what} of simulated streets and rigs, whose truth is exactly known.",
+    )
+
+
+def reference_sigma_option(function: Callable[..., object]) -> Callable[..., object]:
+    """``--reference-sigma DEG M``."""
+    return click.option(
+        "--reference-sigma",
+        type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.0, 1.0)),
+        metavar="DEG M",
+        default=(0.2, 0.05),
+        show_default=True,
+        help="How well the recordings know their own extrinsic, per axis.",
+    )(function)
+
+
 def made(out: Path | None) -> Path | None:
     """The folder of ``--out``, made before anything is measured for it."""
     from monitor.mask_tables import made  # noqa: PLC0415 - loaded with the rest

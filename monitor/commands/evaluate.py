@@ -93,14 +93,7 @@ def _plk_options(runs: int) -> Callable[[Callable[..., object]], Callable[..., o
     """``--runs``, ``--seed``, ``--json`` and ``--out`` of the experiments of PLK-Calib."""
 
     def add(function: Callable[..., object]) -> Callable[..., object]:
-        function = commands.output_options(function)
-        return click.option(
-            "--runs",
-            type=click.IntRange(1, 100_000),
-            default=runs,
-            show_default=True,
-            help="Runs of each row, box or point.",
-        )(function)
+        return commands.runs_option(runs, "each row, box or point")(commands.output_options(function))
 
     return add
 
@@ -125,13 +118,7 @@ def _frame_options(starts: int) -> Callable[[Callable[..., object]], Callable[..
             show_default=True,
             help="Frames of each camera of a recording, spread evenly: first, middle, last.",
         )(function)
-        return click.option(
-            "--simulated",
-            metavar="N",
-            type=click.IntRange(0, 100_000),
-            default=0,
-            help="Frames of simulated streets and rigs, whose extrinsic is exactly known.",
-        )(function)
+        return commands.simulated_option("Frames")(function)
 
     return add
 
@@ -234,14 +221,7 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
     help="Tell calibrate by how much starts may be off, as its option of this name does; default: it takes "
     "them for first guesses.",
 )
-@click.option(
-    "--reference-sigma",
-    type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.0, 1.0)),
-    metavar="DEG M",
-    default=(0.2, 0.05),
-    show_default=True,
-    help="How well the recordings know their own extrinsic, per axis.",
-)
+@commands.reference_sigma_option
 @click.option(
     "--set-sigma",
     "set_sigmas",

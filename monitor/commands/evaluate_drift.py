@@ -32,20 +32,8 @@ _KINDS = (
     "calibwatch evaluate drift street_a.mcap street_b.mcap --kinds healthy,combined --limits 0.5 0.1",
 )
 @click.argument("places", metavar="[RECORDING]...", nargs=-1)
-@click.option(
-    "--simulated",
-    metavar="N",
-    type=click.IntRange(0, 10_000),
-    default=0,
-    help="Drives of simulated streets and rigs, whose truth is exactly known.",
-)
-@click.option(
-    "--runs",
-    type=click.IntRange(1, 100_000),
-    default=40,
-    show_default=True,
-    help="Runs of each kind on each drive; more where a kind has more amounts than that.",
-)
+@commands.simulated_option("Drives")
+@commands.runs_option(40, "each kind on each drive; more where a kind has more amounts than that")
 @click.option(
     "--kinds",
     metavar="KIND,...",
@@ -59,14 +47,7 @@ _KINDS = (
     metavar="DEG M",
     help="Alert limits on every axis; default: each rig's own.",
 )
-@click.option(
-    "--reference-sigma",
-    type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.0, 1.0)),
-    metavar="DEG M",
-    default=(0.2, 0.05),
-    show_default=True,
-    help="How well the recordings know their own extrinsic, per axis.",
-)
+@commands.reference_sigma_option
 @click.option(
     "--baseline",
     type=click.Choice(["none", "other"]),

@@ -19,15 +19,10 @@ from monitor import commands
     show_default=True,
     help="Healthy driving, a few seconds of computing an hour.",
 )
-@click.option(
-    "--runs",
-    type=click.IntRange(1, 10_000),
-    default=10,
-    show_default=True,
-    help="Drives for each drift.",
-)
+@commands.runs_option(10, "each drift")
 @click.option(
     "--streets",
+    metavar="N",
     type=click.IntRange(0, 10_000),
     default=0,
     show_default=True,

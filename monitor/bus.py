@@ -30,6 +30,8 @@ _ENDPOINT = re.compile(r"([a-z-]+)/([^/\s#?].*)")
 _NEVER_IN_KEYS = re.compile(r"[*$?#]|//|^/|/$|^$")
 
 Mode: TypeAlias = Literal["client", "peer", "router"]
+Leaf: TypeAlias = Literal["status", "candidate", "evidence"]
+"""What is said of a pair."""
 Command: TypeAlias = Literal["acknowledge", "snapshot", "accept", "reload"]
 
 
@@ -183,9 +185,14 @@ def _check_endpoint(endpoint: str) -> None:
         raise RigError(f"'{endpoint}': protocol '{match[1]}' is not known", hint=nearest(match[1], PROTOCOLS))
 
 
-def pair_key(vehicle: str, pair: str, leaf: Literal["status", "candidate", "evidence"]) -> str:
+def pair_key(vehicle: str, pair: str, leaf: Leaf) -> str:
     """``calibwatch/<vehicle>/<pair>/<leaf>``; the names are checked."""
     return f"{ROOT}/{_name(vehicle)}/{_name(pair)}/{leaf}"
+
+
+def every_pair_key(vehicle: str, leaf: Leaf) -> str:
+    """``calibwatch/<vehicle>/*/<leaf>``, the key expression of all pairs."""
+    return f"{ROOT}/{_name(vehicle)}/*/{leaf}"
 
 
 def command_key(vehicle: str, pair: str, command: Command) -> str:

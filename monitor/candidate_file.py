@@ -5,7 +5,6 @@
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -159,16 +158,6 @@ def verified(data: bytes, where: str) -> CandidateDocument:
     if not rigid or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise InputError(f"{where}: T_cam_lidar is no rigid transform")
     return document
-
-
-def read_candidate(path: Path) -> CandidateDocument:
-    """Reads and verifies a candidate's file; InputError as :func:`verified`, or where it can not be read."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path} can not be read: {error.strerror}") from error
-    return verified(data, str(path))
 
 
 def json_schema() -> dict[str, Any]:

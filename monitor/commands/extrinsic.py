@@ -8,7 +8,7 @@ import click
 if TYPE_CHECKING:
     from monitor.extrinsic_file import Imported
 
-FORMATS = ("autoware", "calib", "kalibr", "kitti", "matrix", "opencalib", "ros")
+FORMATS = ("autoware", "calib", "candidate", "kalibr", "kitti", "matrix", "opencalib", "ros")
 """Modules of monitor.extrinsic_formats by their names, here for ``--help``; a test holds them together."""
 
 
@@ -35,7 +35,8 @@ def command() -> None:
 @command.command(
     name="import",
     epilog="Examples: calibwatch extrinsic import calib_velo_to_cam.txt --out van.toml; "
-    "calibwatch extrinsic import T.txt --direction T_lidar_cam --pair front --out van.toml",
+    "calibwatch extrinsic import T.txt --direction T_lidar_cam --pair front --out van.toml; "
+    "calibwatch extrinsic import out/front.candidate.json --out proposed.toml (what a watch proposes)",
 )
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The rig file to write, .toml.")
@@ -62,7 +63,7 @@ def import_command(
     size: tuple[int, int] | None,
     force: bool,
 ) -> int:
-    """Make a rig file of FILE: calib.json, KITTI, OpenCalib, ROS transform, Kalibr, Autoware, or a matrix.
+    """Make a rig file of FILE: calib.json, KITTI, OpenCalib, ROS, Kalibr, Autoware, a matrix, or a candidate.
 
     Says in which direction the matrix was read and whether it was inverted. Intrinsics come along where
     FILE has them.

@@ -8,7 +8,7 @@ import threading
 
 import zenoh
 
-from monitor.bus import pair_key
+from monitor.bus import every_pair_key, pair_key
 from monitor.events import Event, ProposalEvent
 from monitor.outputs import OutputKind, session_of
 from pipeline.errors import TransportError
@@ -28,7 +28,7 @@ class CandidateBus:
         self._lock = threading.Lock()
         self._standing: dict[str, bytes] = {}
         try:
-            self._queryable = session.declare_queryable(f"calibwatch/{vehicle}/*/candidate", self._answer)
+            self._queryable = session.declare_queryable(every_pair_key(vehicle, "candidate"), self._answer)
         except zenoh.ZError as error:
             raise TransportError("candidates can not be declared on the bus") from error
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import zenoh
 import zenoh.ext
 
+from monitor.bus import alive_key, every_pair_key, pair_key
 from monitor.events import Event, StatusEvent
 from monitor.outputs import OutputKind, session_of
 from pipeline.errors import TransportError
@@ -44,13 +45,13 @@ class StatusBus:
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
         self._session = session
-        self._prefix = f"calibwatch/{vehicle}"
+        self._vehicle = vehicle
         self._lock = threading.Lock()
         self._said: dict[str, deque[Status]] = {}
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         try:
-            self._queryable = session.declare_queryable(f"{self._prefix}/*/status", self._answer)
-            self._token = session.liveliness().declare_token(f"{self._prefix}/alive")
+            self._queryable = session.declare_queryable(every_pair_key(vehicle, "status"), self._answer)
+            self._token = session.liveliness().declare_token(alive_key(vehicle))
         except zenoh.ZError as error:
             raise TransportError("the status can not be declared on the bus") from error
 
@@ -90,7 +91,7 @@ class StatusBus:
             self._publishers.clear()
 
     def _key(self, pair: str) -> str:
-        return f"{self._prefix}/{pair}/status"
+        return pair_key(self._vehicle, pair, "status")
 
     def _publisher(self, key: str) -> zenoh.ext.AdvancedPublisher:
         return zenoh.ext.declare_advanced_publisher(

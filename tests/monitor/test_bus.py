@@ -111,6 +111,7 @@ def test_mutual_tls_lets_in_whom_the_authority_signed_and_nobody_else(certificat
 
 def test_keys_of_the_specification():
     assert bus.pair_key("van-17", "front", "status") == "calibwatch/van-17/front/status"
+    assert bus.every_pair_key("van-17", "status") == "calibwatch/van-17/*/status"
     assert bus.command_key("van-17", "front", "accept") == "calibwatch/van-17/front/cmd/accept"
     assert bus.alive_key("van-17") == "calibwatch/van-17/alive"
 
@@ -120,6 +121,7 @@ def test_names_that_would_break_a_key(name):
     for build in (
         lambda: bus.alive_key(name),
         lambda: bus.pair_key("v", name, "status"),
+        lambda: bus.every_pair_key(name, "candidate"),
         lambda: bus.replay_prefix(name),
     ):
         with pytest.raises(RigError, match="can not be part of a key"):

@@ -20,6 +20,7 @@ from monitor.extrinsic_formats import Choice, formats, load_document, recognised
 from monitor.rig import load_rig, parse_rig
 from pipeline.errors import CalibwatchError, InputError, RigError
 from pipeline.se3 import inverse, transform
+from tests.monitor.proposals import proposal
 
 DATA = Path(os.environ.get("CALIBWATCH_DATA", Path(__file__).parents[4] / "shared/data"))
 recordings = pytest.mark.skipif(not DATA.is_dir(), reason="no recordings folder (CALIBWATCH_DATA)")
@@ -200,9 +201,29 @@ def test_two_formats_in_one_file_are_told(tmp_path):
     np.testing.assert_allclose(read(path, name="kalibr").T_cam_lidar, T, atol=1e-12)
 
 
+def test_a_proposal_is_taken_as_it_was_signed(tmp_path):
+    document = proposal().document
+    reading = read(written(tmp_path, document.to_json().decode(), "front.candidate.json"))
+    np.testing.assert_allclose(reading.T_cam_lidar, np.array(document.T_cam_lidar), atol=1e-14)
+    assert (reading.name, reading.camera) == ("front", {})
+    assert document.hash in reading.notes[0]
+    assert "the mount of van-17 has moved" in reading.notes[1]
+    assert any("fewer than three windows" in note for note in reading.notes) == (not document.agreed)
+
+
+def test_a_proposal_that_was_changed_is_refused(tmp_path):
+    changed = json.loads(proposal().document.to_json())
+    changed["T_cam_lidar"][0][3] += 0.01
+    with pytest.raises(InputError, match="does not match its hash"):
+        read(written(tmp_path, json.dumps(changed)))
+    with pytest.raises(RigError, match="the file states T_cam_lidar"):
+        read(written(tmp_path, proposal().document.to_json().decode()), direction="T_lidar_cam")
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
+        (json.dumps({"schema": "calibwatch.candidate/1"}), "no calibwatch.candidate/1"),
         ("", "no format"),
         ("1 2 3", "no format"),
         (json.dumps({"cam0": {"T_cam_lidar": [[1, 2], [3]]}}), "no table of numbers"),

@@ -4,50 +4,21 @@ import contextlib
 import json
 import queue
 
-import numpy as np
 import pytest
 import zenoh
 
 from monitor.bus import BusSettings, listening_at, open_session
-from monitor.candidate_file import document_of, read_candidate, verified
+from monitor.candidate_file import verified
 from monitor.events import EndEvent, ProposalEvent, StatusEvent
 from monitor.outputs.candidate import CandidateFiles
 from monitor.outputs.candidate_bus import CandidateBus
 from monitor.outputs.report import Report
 from monitor.outputs.summary import Summary, SummaryFile
 from monitor.parts import Parts, PartShare
-from monitor.statements import Identity
-from monitor.status import Provenance
-from pipeline import se3
-from pipeline.candidate import Candidate, WindowEstimate
 from pipeline.errors import TransportError
-from pipeline.hold_out import HoldOut
-from pipeline.mount import Mount
-from pipeline.records import CameraModel
+from tests.monitor.proposals import proposal
 
 WAIT_S = 10
-NONE = Provenance(hash=None, version=None)
-MOUNT = Mount(
-    camera=CameraModel("pinhole", np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), np.empty(0), 160, 120),
-    T_cam_lidar=se3.transform(se3.AXES_CAM_IN_VEHICLE.T, np.zeros(3)),
-    T_vehicle_lidar=np.eye(4),
-    sigma_rad=0.001,
-    sigma_m=0.01,
-    limits=np.ones(6),
-    required=("yaw",),
-)
-
-
-def proposal(pair="front", lines=None, windows=1):
-    drift = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
-    T = se3.displaced(MOUNT.T_cam_lidar, drift, MOUNT.R_vehicle_cam)
-    p_lines, stored, found = lines or (None, None, None)
-    check = HoldOut(10, 20, 8, 31.5, 50, 0.25, 0.41, 0.42, 1e-4, 0.3, p_lines, stored, found, None)
-    seen = tuple(WindowEstimate(i, i, 30.0 * i, 30.0 * i, 8, np.zeros(6), np.eye(6)) for i in range(windows))
-    candidate = Candidate(20, T, 1e-4 * np.eye(6), seen, agreed=windows >= 3, hold_out=check)
-    return ProposalEvent(pair, document_of(Identity("van-17", pair, NONE, NONE, "test"), MOUNT, candidate))
-
-
 NOTHING = ProposalEvent("front", None, "The frames held out show another extrinsic.")
 
 
@@ -58,7 +29,7 @@ def test_the_file_is_there_while_the_proposal_stands(tmp_path):
     assert not path.exists()
     files.handle(proposal())
     files.handle(proposal("rear"))
-    assert read_candidate(path) == proposal().document
+    assert verified(path.read_bytes(), "file") == proposal().document
     files.handle(NOTHING)
     files.handle(EndEvent(complete=True))
     files.close()

@@ -6,7 +6,7 @@ its first guess: it looks at every fit within reach, and what rival fits leave o
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
@@ -116,28 +116,6 @@ class Calibrated:
     def sigma(self) -> Floats:
         """Standard deviation of each axis, float64 (6,), rad and m."""
         return np.sqrt(np.diag(self.covariance))
-
-
-def calibrate_frames(
-    mount: Mount,
-    pairs: Iterable[FramePair],
-    parameters: Parameters | None = None,
-    segmenter: Segmenter | None = None,
-    settings: CalibrationParameters | None = None,
-) -> Calibrated:
-    """Estimates one extrinsic from all pairs, given in the order of their stamps.
-
-    Args:
-        mount: What is stored; its extrinsic is the first guess.
-        pairs: Frames of one pair of sensors.
-        parameters: Settings of the stages; None: as they ship.
-        segmenter: The network, or None: no masks, no lines.
-        settings: Of the calibration; None: as they ship.
-    """
-    calibrator = Calibrator(mount, parameters or Parameters(), segmenter, settings or CalibrationParameters())
-    for pair in pairs:
-        calibrator.step(pair)
-    return calibrator.finish()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

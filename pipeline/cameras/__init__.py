@@ -149,17 +149,6 @@ def _slopes(camera: CameraModel, points_cam: Floats) -> tuple[Floats, NDArray[np
     return (xy if valid.all() else np.where(valid[:, None], xy, 0.0)), valid
 
 
-def projection_jacobian(camera: CameraModel, points_cam: Floats) -> Floats:
-    """Derivative of the pixel by the point in the camera frame, (N,2,3). The points must project."""
-    z = points_cam[:, 2]
-    xy = points_cam[:, :2] / z[:, None]
-    J_lens = lens_of(camera).jacobian(xy, camera.D)
-    J_xy = np.zeros((len(z), 2, 3))
-    J_xy[:, 0, 0] = J_xy[:, 1, 1] = 1.0 / z
-    J_xy[:, :, 2] = -xy / z[:, None]
-    return np.asarray(camera.K[:2, :2] @ J_lens @ J_xy, dtype=np.float64)
-
-
 _NEWTON_STEPS = 12
 """FORMULAS E3: eight steps reach 5e-13 px; four more for strong wide lenses."""
 

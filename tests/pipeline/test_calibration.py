@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline import labels, se3
-from pipeline.calibration import CalibrationParameters, Calibrator, calibrate_frames, held_directions, leaning
+from pipeline.calibration import CalibrationParameters, Calibrator, held_directions, leaning
 from pipeline.frame_modes import EdgeModes, ModeParameters, Prior
 from pipeline.mount import Mount
 from pipeline.observability import observable
@@ -32,6 +32,13 @@ def mount_of(drive, limits, drift=None):
 
 def pair_of(frame):
     return FramePair("front", frame.cloud, frame.image, frame.cloud_stamp_ns, frame.image_stamp_ns)
+
+
+def calibrate_frames(mount, pairs, segmenter=None, settings=None):
+    calibrator = Calibrator(mount, Parameters(), segmenter, settings or CalibrationParameters())
+    for pair in pairs:
+        calibrator.step(pair)
+    return calibrator.finish()
 
 
 @pytest.mark.parametrize("drift", DRIFTS)
@@ -151,7 +158,7 @@ class Seeing:
 def test_lines_that_agree_with_the_edges_do_not_move_the_answer(drive, straight_frames, limits):
     frame, mount = straight_frames[1], mount_of(drive, limits, DRIFTS[0])
     alone = calibrate_frames(mount, [pair_of(frame)], settings=QUICK)
-    heard = calibrate_frames(mount, [pair_of(frame)], None, Seeing(frame.labels), QUICK)
+    heard = calibrate_frames(mount, [pair_of(frame)], Seeing(frame.labels), QUICK)
     assert heard.observable.all()
     assert np.all(np.abs(heard.drift - alone.drift) < 0.5 * alone.sigma)
     assert heard.modes[0].share >= alone.modes[0].share - 0.05
@@ -170,7 +177,7 @@ def test_lines_beside_their_masks_take_a_fit_its_share(drive, straight_frames, l
         return EdgeModes(((np.zeros(6), 0.4),), np.array([1.0]), np.eye(6) * 1e-6, contrast=1.0, peak=9.0)
 
     monkeypatch.setattr("pipeline.calibration.weighed", weighed)
-    calibrate_frames(mount, [pair_of(frame)], None, Seeing(frame.labels), QUICK)
+    calibrate_frames(mount, [pair_of(frame)], Seeing(frame.labels), QUICK)
     if wrong:
         assert judges[0][0] > 0.9
     else:

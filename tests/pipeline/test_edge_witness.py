@@ -309,8 +309,9 @@ def test_gradient_of_the_score_is_that_of_its_differences(seed, level):
     assert total == pytest.approx(score_only(batch, T, level).sum() / batch.weight.sum()) or level > 0
     # The gradient holds the direction across each edge: differences must hold it too, in the image.
     R = T[:3, :3]
-    J = cameras.projection_jacobian(SMALL, se3.apply(T, batch.position))
-    step = np.einsum("nij,nj->ni", J, batch.direction @ R.T)
+    _, _, xy, A = cameras.project_with_slopes(SMALL, se3.apply(T, batch.position))
+    along = batch.direction @ R.T
+    step = np.einsum("nij,nj->ni", A, along[:, :2] - xy * along[:, 2:])
     angle = np.arctan2(step[:, 1], step[:, 0])
 
     def held(xi):

@@ -3,7 +3,6 @@
 import hashlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from importlib import metadata
 
@@ -122,7 +121,7 @@ def watch(
     losses: Losses,
     stop: threading.Event,
     progress: Callable[[int], None] | None = None,
-    ahead: int = 0,
+    ahead: Forerunner | None = None,
 ) -> State:
     """Drives a stream of messages through the engines until it ends or ``stop`` is set.
 
@@ -132,8 +131,8 @@ def watch(
         losses: What the source could not give, told at the end.
         stop: Ends the run early: what was written says that it is not complete.
         progress: Told the number of pairs after each one.
-        ahead: So many pairs are read before the first of them is judged, and looked at meanwhile in a process
-            of their own. 0 for a source that goes on by itself: what came is then judged at once.
+        ahead: Has pairs looked at before their turn. None for a source that goes on by itself: what came is
+            then judged at once.
 
     Returns:
         The state at the end, the first in precedence over the pairs.
@@ -143,12 +142,9 @@ def watch(
     """
     for engine in watching_.engines.values():
         engine.attach(losses, lambda: watching_.outputs.losses)
-    if ahead > 0:
-        watches = {name: engine.watch for name, engine in watching_.engines.items()}
-        with closing(Forerunner(watches)) as forerunner:
-            arrival_ns = _feed(watching_, messages, stop, progress, (ahead, forerunner))
-    else:
-        arrival_ns = _feed(watching_, messages, stop, progress, None)
+    if ahead is not None:
+        ahead.serve({name: engine.watch for name, engine in watching_.engines.items()})
+    arrival_ns = _feed(watching_, messages, stop, progress, ahead)
     interrupted = stop.is_set()
     if not interrupted:
         for pair in watching_.intake.flush():
@@ -172,11 +168,11 @@ def _feed(
     messages: Iterable[Message | Tick],
     stop: threading.Event,
     progress: Callable[[int], None] | None,
-    ahead: tuple[int, Forerunner] | None,
+    ahead: Forerunner | None,
 ) -> int:
     """Until the messages end or ``stop`` is set; gives the time of the last one, ns."""
     intake, engines = watching_.intake, watching_.engines
-    most, see = (0, _unseen) if ahead is None else (ahead[0], ahead[1].see)
+    most, see = (0, _unseen) if ahead is None else (ahead.most, ahead.see)
     pairs, arrival_ns, told = 0, 0, 0
     for arrival in arrivals(messages, intake, most, see):
         if stop.is_set():
@@ -185,10 +181,10 @@ def _feed(
         arrival_ns = arrival.arrival_ns
         for pair in arrival.pairs:
             pairs += 1
-            found = None if ahead is None else ahead[1].take(pair)
+            found = None if ahead is None else ahead.take(pair)
             _tell(watching_, engines[pair.pair].step(pair, arrival_ns, found))
             if ahead is not None:
-                ahead[1].settle(pair.pair)
+                ahead.settle(pair.pair)
             if progress is not None:
                 progress(pairs)
         for engine in engines.values():

@@ -7,12 +7,14 @@ those of one pair after the other. Where there is no other process, or it fails,
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 from monitor.intake import Accounts, Intake
 from monitor.lookout import Lookout
 from monitor.messages import Message
 from monitor.sources import Tick
+from monitor.threads import one_thread
 from pipeline.errors import CalibwatchError
 from pipeline.records import FramePair
 from pipeline.watch import Foresight, Watch
@@ -79,25 +81,32 @@ class Forerunner:
     """Has pairs looked at, one after the other.
 
     Args:
-        watches: Who will judge them, by name of the pair.
+        most: Pairs that are read before the first of them is judged.
+        expected: Pairs that will come, where that is known: a process that is worth it begins at once.
     """
 
-    def __init__(self, watches: Mapping[str, Watch]) -> None:
-        self._watches = watches
+    def __init__(self, most: int, expected: int | None = None) -> None:
+        self.most = most
+        self._watches: Mapping[str, Watch] = {}
         self._seen = 0
         self._lookout: Lookout | None = None
+        self._threads: ExitStack = ExitStack()
         self._breaks: dict[str, int] = {}
         self._pending: dict[str, deque[tuple[FramePair, int | None]]] = {}
+        if expected is not None and expected >= _WORTH_A_PROCESS:
+            self._begin()
+
+    def serve(self, watches: Mapping[str, Watch]) -> None:
+        """Names those who will judge, by name of the pair; before the first pair."""
+        self._watches = watches
+        self._equip()
 
     def see(self, pair: FramePair) -> None:
         """A pair that will come to its turn."""
         self._seen += 1
         if self._lookout is None and self._seen == _WORTH_A_PROCESS:
-            equipment = {
-                name: (watch.mount, watch.parameters, watch.segmenter)
-                for name, watch in self._watches.items()
-            }
-            self._lookout = Lookout(equipment)
+            self._begin()
+            self._equip()
         number = None
         if self._lookout is not None and self._holds(pair.pair):
             number = self._lookout.ask(pair)
@@ -132,6 +141,21 @@ class Forerunner:
         """Ends the process; what it still had to do is left."""
         if self._lookout is not None:
             self._lookout.close()
+        self._threads.close()
+
+    def _begin(self) -> None:
+        self._lookout = Lookout()
+        # Two processes have two cores to themselves.
+        self._threads.enter_context(one_thread())
+
+    def _equip(self) -> None:
+        if self._lookout is not None:
+            self._lookout.equip(
+                {
+                    name: (watch.mount, watch.parameters, watch.segmenter)
+                    for name, watch in self._watches.items()
+                }
+            )
 
     def _holds(self, name: str) -> bool:
         """Whether what is found ahead is what will be asked for."""

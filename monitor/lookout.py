@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from monitor.clock import SystemClock
 from monitor.handover import give, link, receive
 from monitor.memory import keep_freed
+from monitor.threads import one_thread
 from pipeline.frame_evidence import FrameEvidence, Scout
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
@@ -39,14 +40,10 @@ class Seen:
 
 
 class Lookout:
-    """The process, as the one that judges has it.
+    """The process, as the one that judges has it; it begins with what it will need anyway."""
 
-    Args:
-        equipment: Of every pair's scout, by name of the pair.
-    """
-
-    def __init__(self, equipment: Mapping[str, Equipment]) -> None:
-        self._known = _named(equipment)
+    def __init__(self) -> None:
+        self._known: dict[str, object] = {}
         self._asked: deque[tuple[int, FramePair]] = deque()
         self._count = 0
         self._there = False
@@ -58,6 +55,10 @@ class Lookout:
                 self._process = _started(other)
             except OSError:
                 self._lost = True
+
+    def equip(self, equipment: Mapping[str, Equipment]) -> None:
+        """Tells it, once, what every pair's scout is made of, by name of the pair."""
+        self._known = _named(equipment)
         self._tell(dict(equipment), {})
 
     def ready(self) -> bool:
@@ -128,7 +129,7 @@ def _started(end: socket.socket) -> "subprocess.Popen[bytes]":
 def main() -> None:
     """The process itself; its argument is the number of its end of the link."""
     keep_freed()
-    with socket.socket(fileno=int(sys.argv[1])) as end:
+    with one_thread(), socket.socket(fileno=int(sys.argv[1])) as end:
         try:
             _serve(end)
         except (EOFError, OSError):

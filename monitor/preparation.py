@@ -29,10 +29,12 @@ class Prepared:
     Attributes:
         rig: The rig.
         notes: How it came about, one sentence each.
+        frames: Pairs of a sweep and an image that the recording can hold, or None where it does not say.
     """
 
     rig: Rig
     notes: tuple[str, ...]
+    frames: int | None = None
 
 
 def prepare(
@@ -70,10 +72,10 @@ def prepare(
             )
         else:
             found, found_notes = _discovered(source, topics, location)
-            return Prepared(*_with_drift(known(found), found_notes, drift))
+            return _prepared(known(found), found_notes, drift, topics)
     _check_types(rig, topics, location)
     rig = completed(rig, lambda: _survey(location, topics), needs_extrinsic=needs_extrinsic)
-    return Prepared(*_with_drift(known(rig), notes, drift))
+    return _prepared(known(rig), notes, drift, topics)
 
 
 def _check_types(rig: Rig, topics: Sequence[TopicInfo], location: str) -> None:
@@ -93,10 +95,19 @@ def _check_types(rig: Rig, topics: Sequence[TopicInfo], location: str) -> None:
                 )
 
 
-def _with_drift(rig: Rig, notes: tuple[str, ...], drift: Floats | None) -> tuple[Rig, tuple[str, ...]]:
-    if drift is None:
-        return rig, notes
-    return dataclasses.replace(rig, pairs=tuple(inject(pair, drift) for pair in rig.pairs)), notes
+def _prepared(
+    rig: Rig, notes: tuple[str, ...], drift: Floats | None, topics: Sequence[TopicInfo]
+) -> Prepared:
+    if drift is not None:
+        rig = dataclasses.replace(rig, pairs=tuple(inject(pair, drift) for pair in rig.pairs))
+    counts = {topic.name: topic.count for topic in topics}
+    frames = 0
+    for pair in rig.pairs:
+        sweeps, images = counts.get(pair.lidar.topic or ""), counts.get(pair.camera.topic or "")
+        if sweeps is None or images is None:
+            return Prepared(rig, notes)
+        frames += min(sweeps, images)
+    return Prepared(rig, notes, frames)
 
 
 def _from_file(rig_file: Path, own: dict[str, object] | None, topics: Sequence[TopicInfo], where: str) -> Rig:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 
 from monitor.baseline_file import with_baselines
@@ -9,6 +10,7 @@ from monitor.bus_replay import OverBus
 from monitor.candidate_file import SUFFIX
 from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
+from monitor.lookahead import Forerunner
 from monitor.model_file import model_bytes
 from monitor.outputs import Outputs, Surroundings, open_outputs, write_whole
 from monitor.outputs.summary import FILE_NAME, Summary
@@ -61,15 +63,16 @@ def replay(
         CalibwatchError: The recording, rig or model can not be used; no file then looks whole.
     """
     prepared = prepare(location, rig_file, drift, known=lambda rig: with_baselines(rig, baseline))
-    segmenter = Segmenter(model_bytes(model))
-    outputs = _opened(out, prepared.rig.vehicle, images_hz)
-    try:
-        under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
-        source = open_source(location)
-        with OverBus(source, "replay") if over_zenoh else source as messages:
-            state = watch(under_watch, messages, messages.losses, stop, progress, _AHEAD)
-    finally:
-        outputs.close()
+    with closing(Forerunner(_AHEAD, prepared.frames)) as ahead:
+        segmenter = Segmenter(model_bytes(model))
+        outputs = _opened(out, prepared.rig.vehicle, images_hz)
+        try:
+            under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
+            source = open_source(location)
+            with OverBus(source, "replay") if over_zenoh else source as messages:
+                state = watch(under_watch, messages, messages.losses, stop, progress, ahead)
+        finally:
+            outputs.close()
     if outputs.losses:
         raise _lost(out, outputs.losses, state)
     return Summary.model_validate_json((out / FILE_NAME).read_bytes())

@@ -4,7 +4,9 @@ import dataclasses
 import os
 import signal
 import threading
+from contextlib import closing
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from monitor.daemon import watch, watching
 from monitor.events import EndEvent, FrameEvent, ProposalEvent, StatusEvent
 from monitor.injection import parse_inject
 from monitor.intake import Intake
-from monitor.lookahead import arrivals
+from monitor.lookahead import Forerunner, arrivals
 from monitor.lookout import Lookout
 from monitor.messages import Message
 from monitor.outputs import Outputs
@@ -94,11 +96,12 @@ def later(recorded, seconds):
     return [drives.stamped(m, drives.stamp_of(m) + seconds * SECOND) for m in moved]
 
 
-def told_of(rig, stream, ahead, told=None, stop=None):
+def told_of(rig, stream, ahead, told=None, stop=None, expected=None):
     """What is told of a stream: plain values, but for what stages cost."""
     told = told or Told()
     under = watching(rig, None, Parameters(), Outputs([("told", told)]), Counting())
-    watch(under, stream, Losses(), stop or threading.Event(), ahead=ahead)
+    with closing(Forerunner(ahead, expected)) as forerunner:
+        watch(under, stream, Losses(), stop or threading.Event(), ahead=forerunner if ahead else None)
     return [plain(event) for event in told.events]
 
 
@@ -142,6 +145,32 @@ def test_what_is_found_ahead_is_used(rig, messages, looked_at):
     told_of(rig, stories(messages)["in order"], 5)
     # The first pair is judged while the process begins; the last is decided when the recording ends.
     assert len(looked_at) == 2
+
+
+@pytest.mark.parametrize(("expected", "there"), [(None, False), (24, False), (25, True)])
+def test_a_recording_that_will_be_worth_it_has_its_process_at_once(monkeypatch, expected, there):
+    monkeypatch.setattr("monitor.lookahead._WORTH_A_PROCESS", 25)
+    started = []
+
+    class Noted(Lookout):
+        def __init__(self):
+            super().__init__()
+            started.append(self)
+
+    monkeypatch.setattr("monitor.lookahead.Lookout", Noted)
+    threads = cv2.getNumThreads()
+    with closing(Forerunner(6, expected)):
+        assert bool(started) == there
+        assert cv2.getNumThreads() == (1 if there else threads)
+    assert cv2.getNumThreads() == threads
+
+
+def test_what_was_expected_changes_nothing_that_is_told(rig, messages, looked_at):
+    stream = stories(messages)["a clock that runs back"]
+    plainly = told_of(rig, stream, 0)
+    looked_at.clear()
+    assert told_of(rig, stream, 5, expected=25) == plainly
+    assert len(looked_at) < len(plainly) / 2
 
 
 def test_a_process_that_dies_is_done_without(rig, messages, looked_at, monkeypatch):

@@ -40,6 +40,11 @@ def test_a_recording_that_says_all_needs_no_rig(cut):
     assert (pair.camera.model.width, pair.camera.model.height) == (drives.WIDTH, drives.HEIGHT)
 
 
+def test_it_is_known_how_many_pairs_there_can_be(cut, rig_file):
+    for prepared in (prepare(str(cut(5)), None, None), prepare(str(cut(5)), rig_file(drives.RIG), None)):
+        assert prepared.frames == 5
+
+
 def test_what_a_rig_file_leaves_open_comes_from_the_recording(cut, rig_file):
     pair, own = only(cut(5), rig_file(drives.RIG)), only(cut(5))
     assert pair.name == "front"

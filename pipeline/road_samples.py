@@ -178,24 +178,59 @@ def scatter_of(drives: Sequence[WindowEstimates]) -> Scatter:
     )
     if not near:
         return Scatter(noise=1.0, correlation_m=shortest)
-    degrees = np.array([6 * (len(part) - 1) for part in near])
-    scales = np.array([_restricted(part, shortest)[0] for part in near]) / special.chdtri(degrees, 0.5)
+    alike = _whitened(near)
+    degrees = np.concatenate([np.full(len(some.way_m), some.degrees) for some in alike])
+    squares = np.concatenate([_restricted(some, shortest)[0] for some in alike])
+    scales = squares / special.chdtri(degrees, 0.5)
     samples = sum(effective_samples(part.way_m[:, 1], shortest) - 1.0 for part in near)
     variance = _weighted_median(scales, degrees)
     noise = math.sqrt((_PRIOR_DRIVES + samples * variance) / (_PRIOR_DRIVES + samples))
     lengths = np.geomspace(shortest, _SCENE_LENGTHS * shortest, _CORRELATIONS)
-    likelihoods = [_likelihood(far, float(length)) for length in lengths]
+    alike = _whitened(far)
+    likelihoods = [_likelihood(alike, float(length)) for length in lengths]
     return Scatter(noise=noise, correlation_m=float(lengths[int(np.argmax(likelihoods))]))
 
 
-def _likelihood(parts: Sequence[WindowEstimates], length_m: float) -> float:
-    """Logarithm of the restricted likelihood of a correlation length, each part with a noise of its own."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Alike:
+    """Segments of equally many windows, whitened by what each window states of its error.
+
+    Attributes:
+        way_m: float64 (G,n), way driven at the end of each window, m.
+        values: float64 (G,n,6), whitened estimates.
+        roots: float64 (G,n,36), rows of the symmetric ``C^-1/2`` of each window.
+    """
+
+    way_m: Floats
+    values: Floats
+    roots: Floats
+
+    @property
+    def degrees(self) -> int:
+        """Of freedom, of each segment: its windows less its mean."""
+        return 6 * (int(self.way_m.shape[1]) - 1)
+
+
+def _whitened(parts: Sequence[WindowEstimates]) -> list[_Alike]:
+    """Segments by how many windows they have, so that all of one size are worked on at once."""
+    found = []
+    for size in sorted({len(part) for part in parts}):
+        same = [part for part in parts if len(part) == size]
+        roots = _inverse_roots(np.stack([part.covariance for part in same]))
+        values = np.einsum("gnij,gnj->gni", roots, np.stack([part.drift for part in same]))
+        way_m = np.stack([part.way_m[:, 1] for part in same])
+        found.append(_Alike(way_m, values, roots.reshape(len(same), size, 36)))
+    return found
+
+
+def _likelihood(parts: Sequence[_Alike], length_m: float) -> float:
+    """Logarithm of the restricted likelihood of a correlation length, each segment with its own noise."""
     total = 0.0
-    for part in parts:
-        degrees = 6 * (len(part) - 1)
-        squares, log_determinant = _restricted(part, length_m)
+    for some in parts:
+        squares, log_determinants = _restricted(some, length_m)
         # Estimates that repeat each other to the last digit must not make the logarithm infinite.
-        total -= 0.5 * (log_determinant + degrees * math.log(squares / degrees + 1e-300))
+        fits = log_determinants + some.degrees * np.log(squares / some.degrees + 1e-300)
+        total -= 0.5 * float(fits.sum())
     return total
 
 
@@ -212,31 +247,32 @@ def _weighted_median(values: Floats, weights: np.ndarray) -> float:
     return float(values[order][half])
 
 
-def _restricted(part: WindowEstimates, length_m: float) -> tuple[float, float]:
-    """Squared residuals, whitened, and the log determinants of the restricted likelihood."""
-    roots = _inverse_roots(part.covariance)
-    factor = np.linalg.cholesky(_alike(part.way_m[:, 1], length_m))
-    values = np.einsum("nij,nj->ni", roots, part.drift)
-    values = np.linalg.solve(factor, values).ravel()
-    design = np.linalg.solve(factor, roots.reshape(len(part), 36)).reshape(-1, 6)
+def _restricted(some: _Alike, length_m: float) -> tuple[Floats, Floats]:
+    """Per segment (G,) squared residuals, whitened, and the log determinants of the restricted likelihood."""
+    count, size = some.way_m.shape
+    factor = np.linalg.cholesky(_alike(some.way_m, length_m))
+    values = np.linalg.solve(factor, some.values).reshape(count, 6 * size, 1)
+    design = np.linalg.solve(factor, some.roots).reshape(count, 6 * size, 6)
     # Scaled, for radians and metres differ by orders of magnitude.
-    scale = np.linalg.norm(design, axis=0)
-    q, r = np.linalg.qr(design / scale)
-    residual = values - q @ (q.T @ values)
-    log_determinant = 12.0 * float(np.log(np.diag(factor)).sum())
-    log_determinant += 2.0 * float(np.log(np.abs(np.diag(r)) * scale).sum())
-    return float(residual @ residual), log_determinant
+    scale = np.linalg.norm(design, axis=1)
+    q, r = np.linalg.qr(design / scale[:, None, :])
+    residual = (values - q @ (q.transpose(0, 2, 1) @ values))[:, :, 0]
+    log_determinants = 12.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    log_determinants += 2.0 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2)) * scale).sum(axis=1)
+    return np.einsum("ni,ni->n", residual, residual), log_determinants
 
 
 def _alike(way_m: Floats, length_m: float) -> Floats:
-    """Correlation (N,N) of windows by the way between them."""
-    return np.asarray(np.exp(-np.abs(way_m[:, None] - way_m[None, :]) / length_m), dtype=np.float64)
+    """Correlation (...,N,N) of windows by the way (...,N) between them."""
+    apart = np.abs(way_m[..., :, None] - way_m[..., None, :])
+    return np.asarray(np.exp(-apart / length_m), dtype=np.float64)
 
 
 def _inverse_roots(covariance: Floats) -> Floats:
-    """Symmetric ``C^-1/2``, (N,6,6)."""
+    """Symmetric ``C^-1/2``, (...,6,6)."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1), dtype=np.float64)
+    scaled = vectors / np.sqrt(values)[..., None, :]
+    return np.asarray(scaled @ np.swapaxes(vectors, -1, -2), dtype=np.float64)
 
 
 def effective_samples(way_m: Floats, length_m: float) -> float:
@@ -308,15 +344,18 @@ def largest_change(drive: WindowEstimates, floor: Floats) -> Change:
     information = np.linalg.inv(drive.covariance)
     pulls = [np.einsum("nij,nj->ni", information, values) for values in (drive.drift, drive.feigned)]
     total, (drift, feigned) = information.cumsum(axis=0), (pull.cumsum(axis=0) for pull in pulls)
-    largest = Change(np.zeros(6), 0.0)
     count = len(drive)
-    for split in range(_LEAST_WINDOWS, count - _LEAST_WINDOWS + 1):
-        before = np.linalg.inv(total[split - 1])
-        after = np.linalg.inv(total[-1] - total[split - 1])
-        difference = after @ (drift[-1] - drift[split - 1]) - before @ drift[split - 1]
-        clock = after @ (feigned[-1] - feigned[split - 1]) - before @ feigned[split - 1]
-        P = split * before + (count - split) * after + 2.0 * floor + np.outer(clock, clock)
-        statistic = float(difference @ np.linalg.solve(P, difference))
-        if statistic > largest.statistic:
-            largest = Change(difference, statistic)
-    return largest
+    split = np.arange(_LEAST_WINDOWS, count - _LEAST_WINDOWS + 1)
+    if not split.size:
+        return Change(np.zeros(6), 0.0)
+    last = split - 1
+    before, after = np.linalg.inv(total[last]), np.linalg.inv(total[-1] - total[last])
+    difference, clock = (
+        np.einsum("nij,nj->ni", after, pull[-1] - pull[last]) - np.einsum("nij,nj->ni", before, pull[last])
+        for pull in (drift, feigned)
+    )
+    P = split[:, None, None] * before + (count - split)[:, None, None] * after + 2.0 * floor
+    P = P + clock[:, :, None] * clock[:, None, :]
+    statistic = np.einsum("ni,ni->n", difference, np.linalg.solve(P, difference[:, :, None])[:, :, 0])
+    largest = int(np.argmax(statistic))
+    return Change(difference[largest], float(statistic[largest]))

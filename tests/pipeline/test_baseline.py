@@ -16,6 +16,7 @@ from pipeline.baseline import (
 )
 from pipeline.drift_test import DriftTestParameters
 from pipeline.errors import InputError
+from pipeline.road_samples import samples_of
 from tests.pipeline.simulated_windows import FLOOR, RANDOM, simulated_drive
 
 PARAMETERS = DriftTestParameters()
@@ -60,6 +61,39 @@ def test_exact_means_give_the_closed_form():
     assert whitened(found.covariance) == pytest.approx(whitened(spread) / 5, abs=1e-3)
     assert found.deviation == pytest.approx(means.std(axis=0, ddof=1), rel=1e-4)
     assert found.own == pytest.approx(np.zeros(6), abs=1e-5)
+
+
+def plainly(samples, rounds):
+    """Expectation and maximisation round by round, window by window; whitened by the floor."""
+    unwhiten = np.linalg.inv(np.linalg.cholesky(FLOOR))
+    windows = [
+        (1.0 / len(sample.drift), unwhiten @ y, unwhiten @ N @ unwhiten.T)
+        for sample in samples
+        for y, N in zip(sample.drift, sample.covariance, strict=True)
+    ]
+    spread = np.eye(6)
+    for _ in range(rounds):
+        held = [(w, y, np.linalg.inv(spread + N)) for w, y, N in windows]
+        covariance = np.linalg.inv(sum(w * P for w, _, P in held))
+        bias = covariance @ sum(w * P @ y for w, y, P in held)
+        total = PRIOR_SCENES * np.eye(6)
+        for w, y, P in held:
+            scene = spread @ P @ (y - bias)
+            left = spread - spread @ P @ spread + spread @ P @ covariance @ P @ spread
+            total = total + w * (np.outer(scene, scene) + left)
+        spread = total / (PRIOR_SCENES + len(samples))
+    return spread
+
+
+@pytest.mark.parametrize("scale", [0.05, 4.0])
+def test_the_spread_is_where_many_plain_rounds_end(scale):
+    rng = np.random.default_rng(8)
+    drives = [
+        dataclasses.replace(drive, covariance=drive.covariance * rng.uniform(0.3, 3.0, (len(drive), 1, 1)))
+        for drive in simulated(8, 6, spread=scale * FLOOR)
+    ]
+    samples, _ = samples_of(drives)
+    assert whitened(taught(drives).spread) == pytest.approx(plainly(samples, 400), abs=1e-5)
 
 
 def test_one_street_claims_no_spread_and_no_narrower_bound():

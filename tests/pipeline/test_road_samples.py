@@ -165,3 +165,36 @@ def test_too_few_windows_and_the_speed_of_a_fooled_clock_show_no_change():
 
 def test_a_drive_without_windows_gives_no_stretch():
     assert stretches_of(windows([])) == []
+
+
+def test_segments_of_all_sizes_are_weighed_as_each_by_itself():
+    """Noise and correlation from a handful of drives whose segments differ in size: permuted, they stay."""
+    rng = np.random.default_rng(11)
+    parts = [
+        simulated_drive(rng, f"{i}", noise=1.4, way_m=600.0, step_m=step)
+        for i, step in enumerate((3.0, 4.0, 7.0, 11.0, 13.0))
+    ]
+    found = [scatter_of([parts[i] for i in order]) for order in ([0, 1, 2, 3, 4], [4, 2, 0, 3, 1])]
+    assert found[0].noise == pytest.approx(found[1].noise, rel=1e-9)
+    assert found[0].correlation_m == found[1].correlation_m
+
+
+def test_the_largest_change_is_the_largest_of_all_splits():
+    rng = np.random.default_rng(12)
+    drive = simulated_drive(rng, "slips", way_m=150.0)
+    drive = dataclasses.replace(drive, feigned=rng.normal(size=drive.feigned.shape) * 1e-3)
+    information = np.linalg.inv(drive.covariance)
+    best = 0.0
+    for split in range(3, len(drive) - 2):
+        sides = []
+        for part in (slice(None, split), slice(split, None)):
+            total = np.linalg.inv(information[part].sum(axis=0))
+            means = [
+                total @ sum(J @ v for J, v in zip(information[part], values[part], strict=True))
+                for values in (drive.drift, drive.feigned)
+            ]
+            sides.append((*means, len(information[part]) * total))
+        (before, early, P), (after, late, Q) = sides
+        P = P + Q + 2.0 * FLOOR + np.outer(late - early, late - early)
+        best = max(best, float((after - before) @ np.linalg.solve(P, after - before)))
+    assert largest_change(drive, FLOOR).statistic == pytest.approx(best, rel=1e-9)

@@ -161,11 +161,14 @@ class Drive:
 
     Args:
         parameters: What is driven.
+        scene: Where; None: the street of the parameters.
     """
 
-    def __init__(self, parameters: DriveParameters) -> None:
+    def __init__(self, parameters: DriveParameters, scene: Scene | None = None) -> None:
         self.parameters = parameters
-        self.scene: Scene = draw_scene(parameters.scene, np.random.default_rng(parameters.seed))
+        if scene is None:
+            scene = draw_scene(parameters.scene, np.random.default_rng(parameters.seed))
+        self.scene = scene
         ends = self.T_world_vehicle(np.array([0.0, parameters.duration]))[:, 0, 3]
         self._shadows: ShadowMap = shadow_map(self.scene, (float(ends[0]) - 20.0, float(ends[1]) + _VIEW_M))
         self._optics: Optics = optics_of(parameters.camera)

@@ -50,7 +50,8 @@ class EdgeWitnessParameters:
             chance gives so many in one case of twenty.
         wide_rad: Step of the turns from which it is sought: the coarsest level's blur reaches half of it.
         wide_m: Shift ahead and back from which it is sought.
-        farthest_rad: A maximum further from the stored extrinsic is not believed.
+        farthest_rad: A maximum further from the stored extrinsic is not believed: what the grid of turns
+            holds, and the blur beyond it.
         farthest_m: Likewise.
         contrast_starts: Random extrinsics that tell the score of chance.
         contrast_rad: Their rotation: least and most.
@@ -70,7 +71,7 @@ class EdgeWitnessParameters:
     least_preference: float = 1.64
     wide_rad: float = math.radians(0.75)
     wide_m: float = 0.3
-    farthest_rad: float = math.radians(5.0)
+    farthest_rad: float = math.radians(7.0)
     farthest_m: float = 1.0
     contrast_starts: int = 48
     contrast_rad: tuple[float, float] = (math.radians(3.0), math.radians(6.0))
@@ -273,10 +274,12 @@ def _promising(thin: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParamet
     """
     ticks = np.arange(-_TICKS, _TICKS + 1) * parameters.wide_rad
     turns = np.stack(np.meshgrid(ticks, ticks, ticks[_TICKS % 2 :: 2], indexing="ij"), axis=-1).reshape(-1, 3)
+    turns = turns[np.linalg.norm(turns, axis=1) <= (_TICKS + 0.5) * parameters.wide_rad]
     places = np.hstack([turns, np.zeros_like(turns)])
     level = len(thin.images) - 1
-    seen = seen_from(thin.thinned(_COARSE_STRIDE), [se3.retract(T_stored, place) for place in places])
-    heights = np.bincount(seen.cell, score_only(seen, np.eye(4), level))
+    heights = _heights(
+        thin.thinned(_COARSE_STRIDE), [se3.retract(T_stored, place) for place in places], level
+    )
     starts: list[Floats] = []
     for k in np.argsort(-heights, kind="stable"):
         if len(starts) == _PROMISING:
@@ -287,11 +290,24 @@ def _promising(thin: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParamet
     return [*starts, ahead, -ahead]
 
 
+def _heights(batch: EdgeBatch, extrinsics: Sequence[Floats], level: int) -> Floats:
+    """Score (K,) under each extrinsic, up to a factor."""
+    heights = []
+    for k in range(0, len(extrinsics), _AT_ONCE):
+        seen = seen_from(batch, extrinsics[k : k + _AT_ONCE])
+        heights.append(np.bincount(seen.cell, score_only(seen, np.eye(4), level)))
+    return np.concatenate(heights)
+
+
+_AT_ONCE = 64
+"""Extrinsics that are scored together: their edges fit the cache; all at once take five times as long."""
+
 _SEARCHED = 1200
 """Edges that a search from further away looks at; all of them decide."""
 
-_TICKS = 3
-"""Steps of the grid to each side; every other one of roll, which is seen less sharply."""
+_TICKS = 8
+"""Steps of the grid to each side, 6 deg: where the truth lies outside every maximum is false, and some look
+like a small drift. Every other step of roll, which is seen less sharply."""
 
 _PROMISING = 5
 """Best places of the grid that are climbed from."""

@@ -91,6 +91,15 @@ def test_a_degree_is_bridged_by_the_coarser_levels_and_costs_score(window, axis)
     assert min(found.block_gains) > 0
 
 
+@pytest.mark.parametrize("xi_deg", [(5, 0, 0), (0, -5, 0), (0, 0, 5), (3, -3, 3)])
+def test_five_degrees_are_found_back_from_a_grid_of_turns(window, solved, xi_deg):
+    frames, camera, T_true = window
+    T_stored = se3.retract(T_true, np.concatenate([np.radians(xi_deg), np.zeros(3)]))
+    found = solve(batch_of(frames, camera, P.most_edges), T_stored, FLOOR, P, np.random.default_rng(1))
+    again = se3.local(se3.retract(T_true, solved.xi), se3.retract(T_stored, found.xi))
+    assert np.abs(again / UNITS).max() < 0.1
+
+
 def test_covariance_is_one_and_scatter_is_of_its_size(solved, window):
     C = solved.covariance
     np.testing.assert_allclose(C, C.T, rtol=1e-9, atol=1e-18)

@@ -3,7 +3,7 @@
 from datetime import UTC, datetime, timedelta
 
 from monitor.status import AxisDrift, AxisName, State, Status, unit_of
-from pipeline.motion import ToldSpin
+from pipeline.spin_sense import ToldSpin
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

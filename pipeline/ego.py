@@ -12,16 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.deskew import Spin, SpinSense, Twist, deskew, sweep_times
-from pipeline.motion import (
-    TELLING_M_S,
-    Motion,
-    SpinEvidence,
-    ToldSpin,
-    estimate_twist,
-    spin_evidence,
-    spin_sense,
-)
+from pipeline.motion import Motion, estimate_twist
 from pipeline.records import Floats, FramePair, PointCloud
+from pipeline.spin_sense import TELLING_M_S, SpinEvidence, ToldSpin, spin_evidence, spin_sense
 from pipeline.surfels import Surfels, surfels
 
 _NS = 1e9

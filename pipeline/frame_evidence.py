@@ -20,12 +20,12 @@ from pipeline.gradients import gradient_pyramid
 from pipeline.ground import Ground, fit_ground
 from pipeline.line_witness import LineFrame
 from pipeline.masks import horizon_line, masks_from_probabilities
-from pipeline.motion import ToldSpin
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.segmentation import Segmenter, grid_scale
 from pipeline.sensor_seat import SensorSeat, sensor_seat
+from pipeline.spin_sense import ToldSpin
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
 """Measures what is done inside it, under a name."""

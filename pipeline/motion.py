@@ -5,19 +5,16 @@ moving vehicles can not pull. Nothing is set per sensor or frame: no axis, no ri
 scene leaves a direction free (a tunnel, an open field) no motion is claimed.
 """
 
-import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipeline.deskew import Twist, displaced
-from pipeline.ground import plane_basis
+from pipeline.deskew import Twist
 from pipeline.records import Floats, PointCloud, read_only
+from pipeline.surfel_matches import ALIKE_COSINE, LOSS_SCALE, Matches, matched, normal_equations
 from pipeline.surfels import Surfels, surfels
 
 UnknownReason: TypeAlias = Literal[
@@ -30,12 +27,6 @@ around, wrong match); the covariance is too large; faster than a vehicle."""
 MIN_SURFELS = 150
 """Surfels below which nothing is registered: 25 for each of six unknowns."""
 
-SURFACE_SIGMA_M = 0.01
-"""m; what walls and roads are not flat within a cell, added to the measured thickness."""
-
-ALIKE_COSINE = 0.85
-"""Least cosine between the normals of a match: 32 deg, beyond it lies another side of a thing."""
-
 ITERATIONS = 25
 """Gauss-Newton steps at most; from the last twist it takes six to ten, for each re-pairs the surfels."""
 
@@ -45,10 +36,6 @@ sweeps."""
 
 LEVER_M = 10.0
 """m; from here on turning by a little is seen rather than told apart from moving: the width of a street."""
-
-LOSS_SCALE = 3.0
-"""Robust (Geman-McClure) scale in standard deviations; at twice it a match counts 1/25; what lies within it
-fits."""
 
 LONGEST_S = 0.5
 """s between two sweeps: a vehicle that brakes or steers hard changes its speed by 4 m/s in it, and the
@@ -87,17 +74,6 @@ MAX_SIGMA_RAD_S = math.radians(2.0)
 UNTIMED_SHARE = 0.015
 """Error of the velocity as a share of the speed where points have no times: things passed at some metres are
 seen later in the turn, by a hundredth of the time between the sweeps (simulated: 0.7 to 1.5 %)."""
-
-_TURN = 2.0 * math.pi
-_HALF_WAY = 0.5
-"""Turns; the border between two of -1, 0 and +1."""
-_SURE = 3.0
-"""Standard deviations by which a spin sense must be told."""
-_LEAST_PAIRS = 3
-"""Pairs of sweeps behind a spin sense: fewer show no scatter, and one distorted sweep would decide."""
-
-TELLING_M_S = 3.0
-"""m/s; slower sweeps are not bent enough to hold a configured sense of rotation against them."""
 
 VARIANCE_INFLATION = 4.0
 """Neighbouring surfels err together (one wall, one bend of the road): seen as scatter of twice the plain
@@ -139,33 +115,6 @@ class MotionUnknown:
     free: Floats | None = None
 
 
-_Pairs: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""Indices (m,) into the later surfels and (m,) into the earlier."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Matches:
-    """Surfels of the later sweep beside those of the earlier one, whitened.
-
-    Attributes:
-        tau: float64 (m,), s between the two measurements.
-        moved: float64 (m,3), later centres at the instant of the earlier ones.
-        normal: float64 (m,3), of the earlier surfels.
-        sigma: float64 (m,), m, of the distance across the plane.
-        error: float64 (m,), distance across the plane over ``sigma``.
-        scale: Robust standard deviation of ``error``.
-        weight: float64 (m,), 0..1, of the robust loss.
-    """
-
-    tau: Floats
-    moved: Floats
-    normal: Floats
-    sigma: Floats
-    error: Floats
-    scale: float
-    weight: Floats
-
-
 def estimate_twist(
     previous: PointCloud | Surfels, current: PointCloud | Surfels, seconds: float, start: Twist | None
 ) -> Motion | MotionUnknown:
@@ -196,15 +145,15 @@ def estimate_twist(
         start = _searched(earlier, later, tree, seconds)
     twist = start
     for _ in range(ITERATIONS):
-        matches = _matched(earlier, later, tree, seconds, twist)
+        matches = matched(earlier, later, tree, seconds, twist)
         if len(matches.tau) < MIN_SURFELS:
             return MotionUnknown("no agreement")
-        information, gradient = _normal_equations(matches)
+        information, gradient = normal_equations(matches)
         # A billionth of the largest entry keeps a free direction where it is; it is told below.
         ridge = 1e-9 * float(np.trace(information)) * np.eye(6)
         step = np.asarray(-np.linalg.solve(information + ridge, gradient), dtype=np.float64)
         twist = Twist(twist.omega + step[:3], twist.velocity + step[3:])
-        if _settled(step, seconds):
+        if settled(step, seconds):
             break
         if float(np.linalg.norm(twist.velocity)) > FASTEST_M_S:
             return MotionUnknown("implausible speed")
@@ -212,55 +161,13 @@ def estimate_twist(
     return _judged(matches, later, twist, seconds, timed=timed)
 
 
-def _paired(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float, twist: Twist) -> _Pairs:
-    """Nearest earlier surfel for each of the later, where it lies within a cell and faces alike."""
-    distance, found = tree.query(displaced(later.centre, np.full(len(later), seconds), twist))
-    nearest = np.asarray(found, dtype=np.int64)
-    turned = later.normal @ twist.pose(seconds)[:3, :3].T
-    alike = np.abs(np.einsum("ij,ij->i", turned, earlier.normal[nearest])) > ALIKE_COSINE
-    chosen = np.flatnonzero(alike & (distance < earlier.size[nearest]))
-    return chosen, nearest[chosen]
-
-
-def _compared(earlier: Surfels, later: Surfels, pairs: _Pairs, tau: Floats, twist: Twist) -> _Matches:
-    """The pairs under a twist that lasted ``tau`` (m,) between the two measurements."""
-    chosen, partner = pairs
-    moved = displaced(later.centre[chosen], tau, twist)
-    normal = earlier.normal[partner]
-    sigma = np.sqrt(earlier.thickness[partner] ** 2 + later.thickness[chosen] ** 2 + SURFACE_SIGMA_M**2)
-    error = np.einsum("ij,ij->i", moved - earlier.centre[partner], normal) / sigma
-    scale = max(1.4826 * float(np.median(np.abs(error))), 1e-3) if chosen.size else 1.0
-    weight = 1.0 / (1.0 + (error / (LOSS_SCALE * scale)) ** 2) ** 2
-    return _Matches(tau, moved, normal, sigma, error, scale, weight)
-
-
-def _matched(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float, twist: Twist) -> _Matches:
-    pairs = _paired(earlier, later, tree, seconds, twist)
-    tau = np.full(pairs[0].size, seconds)
-    if earlier.time is not None and later.time is not None:
-        tau = tau + later.time[pairs[0]] - earlier.time[pairs[1]]
-    return _compared(earlier, later, pairs, tau, twist)
-
-
-def _jacobian(matches: _Matches) -> Floats:
-    """Derivative (m,6) of ``error`` by the twist: the left one, ``tau [p x n, n] / sigma``."""
-    lever = np.concatenate([np.cross(matches.moved, matches.normal), matches.normal], axis=1)
-    return np.asarray(lever * (matches.tau / matches.sigma)[:, None])
-
-
-def _normal_equations(matches: _Matches) -> tuple[Floats, Floats]:
-    J = _jacobian(matches)
-    weighted = J * matches.weight[:, None]
-    return weighted.T @ J, weighted.T @ matches.error
-
-
-def _settled(step: Floats, seconds: float) -> bool:
+def settled(step: Floats, seconds: float) -> bool:
     """Whether a step (6,) of the twist moves nothing any more."""
     return float(max(LEVER_M * np.abs(step[:3]).max(), np.abs(step[3:]).max())) * seconds < SETTLED_M
 
 
 def _judged(
-    matches: _Matches, later: Surfels, twist: Twist, seconds: float, *, timed: bool
+    matches: Matches, later: Surfels, twist: Twist, seconds: float, *, timed: bool
 ) -> Motion | MotionUnknown:
     """The motion, or what speaks against it."""
     R = twist.pose(seconds)[:3, :3]
@@ -278,7 +185,7 @@ def _judged(
     if float(agreement[0]) < MIN_AGREEMENT:
         against = whiten @ axes[:, 0]
         return MotionUnknown("no agreement", read_only(against / np.linalg.norm(against)))
-    information, _ = _normal_equations(matches)
+    information, _ = normal_equations(matches)
     spread = VARIANCE_INFLATION * matches.scale**2 * np.linalg.inv(information)
     covariance = np.asarray(0.5 * (spread + spread.T), dtype=np.float64)
     sigma = np.sqrt(np.diag(covariance))
@@ -323,102 +230,3 @@ def _searched(earlier: Surfels, later: Surfels, tree: cKDTree, seconds: float) -
         misfit[~alike | (distance > np.maximum(earlier.size[nearest], SEARCH_STEP_M))] = 1.0
         cost[k] = misfit.mean()
     return Twist(np.zeros(3), tried[int(np.argmin(cost))] / seconds)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SpinEvidence:
-    """In which sense the beams went round, told by the bend of the sweeps.
-
-    Attributes:
-        turns: +1 where the sweep was measured counter-clockwise, -1 clockwise, 0 where it is all of one
-            instant (motion compensated, or a flash).
-        sigma: Standard deviation of ``turns``.
-    """
-
-    turns: float
-    sigma: float
-
-
-def spin_evidence(
-    previous: PointCloud | Surfels,
-    current: PointCloud | Surfels,
-    seconds: float,
-    sweep_s: float,
-    axis: Floats,
-    start: Twist | None,
-) -> SpinEvidence | MotionUnknown:
-    """Measures in which sense a moving LiDAR spins, by a seventh unknown of the registration.
-
-    A thing that the vehicle passes is seen in another direction by the later sweep, so at another time of
-    the turn: ``tau = seconds + turns sweep_s (azimuth difference) / 2 pi``. A wrong ``turns`` leaves
-    residuals that grow with the square of the speed: a pair of sweeps at 10 m/s gives it to 0.3, at 3 m/s
-    it gives nothing. Times of the clouds are left aside.
-
-    Args:
-        previous: The earlier sweep, NOT straightened, or its surfels.
-        current: The later sweep, likewise.
-        seconds: Stamp of the later sweep minus that of the earlier, > 0.
-        sweep_s: Duration of a turn, s.
-        axis: float64 (3,), unit, LiDAR frame: the spin axis, upwards.
-        start: The last twist, or None.
-    """
-    earlier = _timeless(previous)
-    later = _timeless(current)
-    motion = estimate_twist(earlier, later, seconds, start)
-    if isinstance(motion, MotionUnknown):
-        return motion
-    tree = cKDTree(earlier.centre)
-    azimuths = [_azimuth(s.centre, axis) for s in (earlier, later)]
-    twist, turns = motion.twist, 0.0
-    for _ in range(ITERATIONS):
-        pairs = _paired(earlier, later, tree, seconds, twist)
-        angle = azimuths[1][pairs[0]] - azimuths[0][pairs[1]]
-        share = angle / _TURN - np.round(angle / _TURN)
-        matches = _compared(earlier, later, pairs, seconds + turns * sweep_s * share, twist)
-        rate = np.cross(twist.omega, matches.moved) + twist.velocity
-        bend = np.einsum("ij,ij->i", matches.normal, rate) * sweep_s * share / matches.sigma
-        J = np.column_stack([_jacobian(matches), bend])
-        weighted = J * matches.weight[:, None]
-        information = weighted.T @ J
-        ridge = 1e-9 * float(np.trace(information)) * np.eye(7)
-        step = -np.linalg.solve(information + ridge, weighted.T @ matches.error)
-        twist = Twist(twist.omega + step[:3], twist.velocity + step[3:6])
-        turns += float(step[6])
-        if _settled(step[:6], seconds):
-            break
-    variance = VARIANCE_INFLATION * matches.scale**2 * float(np.linalg.inv(information + ridge)[6, 6])
-    return SpinEvidence(turns, math.sqrt(variance))
-
-
-ToldSpin: TypeAlias = Literal["cw", "ccw", "one instant"]
-"""What sweeps say of the rotation; one instant: their points were brought to one, or are a flash's."""
-
-
-def spin_sense(evidence: Sequence[SpinEvidence]) -> ToldSpin | None:
-    """What several pairs of sweeps say together; None while they leave it open.
-
-    The weighted mean must lie nearer to -1, 0 or +1 than to the next of them by three standard deviations,
-    which are widened where the pairs scatter more than they claim.
-    """
-    if len(evidence) < _LEAST_PAIRS:
-        return None
-    turns = np.array([e.turns for e in evidence])
-    weight = np.array([e.sigma for e in evidence]) ** -2.0
-    mean = float(turns @ weight / weight.sum())
-    scatter = float(((turns - mean) ** 2) @ weight) / (len(turns) - 1)
-    nearest = round(mean)
-    if abs(mean - nearest) + _SURE * math.sqrt(max(1.0, scatter) / float(weight.sum())) > _HALF_WAY:
-        return None
-    senses: dict[int, ToldSpin] = {-1: "cw", 0: "one instant", 1: "ccw"}
-    return senses.get(nearest)
-
-
-def _timeless(sweep: PointCloud | Surfels) -> Surfels:
-    found = sweep if isinstance(sweep, Surfels) else surfels(sweep)
-    return dataclasses.replace(found, time=None)
-
-
-def _azimuth(points: Floats, axis: Floats) -> Floats:
-    """Angle (N,) about ``axis``, counter-clockwise from anywhere, rad."""
-    plan = points @ plane_basis(axis).T
-    return np.arctan2(plan[:, 1], plan[:, 0])

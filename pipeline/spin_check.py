@@ -4,17 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.motion import (
-    LONGEST_S,
-    TELLING_M_S,
-    Motion,
-    SpinEvidence,
-    ToldSpin,
-    estimate_twist,
-    spin_evidence,
-    spin_sense,
-)
+from pipeline.motion import LONGEST_S, Motion, estimate_twist
 from pipeline.records import Floats, PointCloud
+from pipeline.spin_sense import TELLING_M_S, SpinEvidence, ToldSpin, spin_evidence, spin_sense
 from pipeline.surfels import surfels
 
 _APART = 2

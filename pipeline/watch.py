@@ -18,11 +18,11 @@ from pipeline.edge_witness import EdgeFrame
 from pipeline.frame_evidence import DropReason, FrameEvidence, Scout, Stage, edge_frame, unmeasured
 from pipeline.inquiry import Inquiry
 from pipeline.line_witness import LineFrame
-from pipeline.motion import ToldSpin
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.segmentation import Segmenter
+from pipeline.spin_sense import ToldSpin
 from pipeline.step_seeker import StepSeeker
 
 

@@ -13,7 +13,7 @@ from monitor.drift_drives import KnownDrive, Place
 from monitor.drift_rows import Row, Rows, Said, Six, SixFlags
 from monitor.statements import TO_PEOPLE
 from monitor.status import State
-from pipeline import drift_trials
+from pipeline import drift_trials, staging
 from pipeline.belief import Belief
 from pipeline.drift_trials import KINDS, Kind, Trial
 from pipeline.parameters import Parameters
@@ -96,7 +96,7 @@ def run(
     # By name, so that a run is the same whichever drives are evaluated beside it.
     rng = np.random.default_rng([options.seed, zlib.crc32(drive.name.encode()), KINDS.index(kind), number])
     trial = drift_trials.draw(kind, number, drive.mount, rng)
-    staged = drift_trials.stage(trial, drive.mount, drive.frames, rng)
+    staged = staging.stage(trial, drive.mount, drive.frames, rng)
     begun_ns = clock.monotonic_ns()
     watch = Watch(staged.mount, options.parameters, segmenter)
     states: list[tuple[State, float]] = []

@@ -8,8 +8,9 @@ from pathlib import Path
 from monitor.drift_summary import RECORDED, SIMULATED, Calling, Cell, Honest, Share, Smallest, Summary
 from monitor.outputs import write_whole
 from monitor.status import STATES
-from pipeline.drift_trials import CROPPED_PX, MOVED_M, TURNED_DEG, Kind
+from pipeline.drift_trials import Kind
 from pipeline.errors import CalibwatchError
+from pipeline.staging import CROPPED_PX, MOVED_M, TURNED_DEG
 
 _TITLES: dict[Kind, str] = {
     "compensating": "Two axes wrong that leave the bearing at 20 m as it was.",

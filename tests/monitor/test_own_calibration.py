@@ -8,7 +8,7 @@ import pytest
 
 from monitor import drift_drives
 from monitor.model_file import open_segmenter
-from pipeline import drift_trials
+from pipeline import drift_trials, staging
 from pipeline.parameters import Parameters
 from pipeline.watch import Watch
 
@@ -66,7 +66,7 @@ def test_a_street_told_in_other_words_is_never_drifted(street, seed, segmenter):
     (drive,) = drives(street)
     rng = np.random.default_rng([seed, STREETS.index(street)])
     trial = drift_trials.draw("healthy", 0, drive.mount, rng)
-    staged = drift_trials.stage(trial, drive.mount, drive.frames, rng)
+    staged = staging.stage(trial, drive.mount, drive.frames, rng)
     watch, states = watched(staged.mount, staged.frames, segmenter)
     assert not {"drifted", "suspect"} & set(states)
     assert watch.belief is not None

@@ -10,13 +10,13 @@ import pytest
 from pipeline import inquiry as module
 from pipeline import se3, verdict
 from pipeline.causes import Cause, CauseParameters, Explanation
-from pipeline.drift_trials import turned_image
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import CameraImage, CameraModel, FramePair
 from pipeline.simulation.drive import Drive, DriveParameters, Motion
 from pipeline.simulation.lidar import spinning
 from pipeline.simulation.scene import SceneParameters
+from pipeline.staging import turned_image
 from pipeline.watch import Watch
 
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.20, 0.15, 0.15])

@@ -13,7 +13,7 @@ from monitor.drift_evaluation import Options, run
 from monitor.drift_rows import FILE_NAME
 from monitor.model_file import open_segmenter
 from monitor.statements import TO_PEOPLE
-from pipeline import drift_trials, se3
+from pipeline import se3, staging
 from pipeline.drift_trials import KINDS
 from pipeline.errors import InputError
 from pipeline.parameters import Parameters
@@ -89,9 +89,9 @@ def test_undisguised_a_drive_is_judged_as_by_replay(cut, segmenter, monkeypatch)
     """With nothing told in other words, what is said is what a watch over the frames says."""
     (place,) = recorded([str(cut(7))], np.zeros(6))
     (drive,) = place.read()
-    monkeypatch.setattr(drift_trials, "TURNED_DEG", 0.0)
-    monkeypatch.setattr(drift_trials, "MOVED_M", 0.0)
-    monkeypatch.setattr(drift_trials, "CROPPED_PX", 0)
+    monkeypatch.setattr(staging, "TURNED_DEG", 0.0)
+    monkeypatch.setattr(staging, "MOVED_M", 0.0)
+    monkeypatch.setattr(staging, "CROPPED_PX", 0)
     row = run(drive, "healthy", 0, segmenter, Options(), Clock())
     watch = Watch(drive.mount, Parameters(), segmenter)
     for frame in drive.frames:

@@ -5,20 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import drift_test, edge_witness, fusion, line_witness, se3
+from pipeline import drift_test, edge_witness, fusion, se3
 from pipeline.drift_test import Evidence, Judgement
 from pipeline.edge_witness import EdgeFrame, EdgeSolution, Trail
 from pipeline.fusion import Testimony
+from pipeline.line_hearing import heard, match_lines
 from pipeline.line_witness import LineFrame, LineSolution
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, LineMatch, read_only
-
-_LINES_FIT = 1e-3
-"""Chance of right pairs to fit each other no better; below it some are wrong, nobody knows which."""
-
-_LINES_REACH = 2.5
-"""Sigmas of the prior of the matching: an answer beyond it comes from lines taken for each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,8 +70,9 @@ def believe(
     feigned = np.mean([f.feigned for f in edge_frames] or [np.zeros(6)], axis=0)
     doubt = expectation.floor + np.outer(feigned, feigned) + expectation.covariance
     edges = _solve_edges(mount, parameters, edge_frames, (T_expected, B.T @ doubt @ B), trail)
-    matched = _solve_lines(mount, line_frames, T_expected)
-    lines = matched if matched is not None and _testifies(matched) else None
+    matched = match_lines(line_frames, mount.camera, T_expected)
+    told = None if edges is None else edges.xi
+    lines = heard(matched, line_frames, mount.camera, T_expected, told)
     edges_drift = None if edges is None else _testimony(edges.xi, np.linalg.inv(edges.covariance), B)
     lines_drift = None
     if lines is not None:
@@ -127,20 +123,6 @@ def _solve_edges(
     batch = edge_witness.batch_of(frames, mount.camera, settings.most_edges)
     rng = np.random.default_rng(parameters.seed)
     return edge_witness.solve(batch, T_expected, doubt, settings, rng, trail)
-
-
-def _solve_lines(mount: Mount, frames: Sequence[LineFrame], T_expected: Floats) -> LineSolution | None:
-    if not frames:
-        return None
-    solution = line_witness.solve_lines(list(frames), mount.camera, T_expected)
-    return solution if solution.estimate.features > 0 else None
-
-
-def _testifies(lines: LineSolution) -> bool:
-    """Whether matched lines may be heard: fitting each other, within reach of the matching."""
-    estimate = lines.estimate
-    within = bool(np.all(np.abs(estimate.xi) <= _LINES_REACH * line_witness.PRIOR_SIGMA))
-    return within and lines.fit >= _LINES_FIT
 
 
 def _testimony(xi: Floats, information: np.ndarray, B: Floats) -> Testimony:

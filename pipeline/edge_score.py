@@ -6,7 +6,7 @@ edges, so what one frame adds to it can be known once and be added again (FORMUL
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -202,24 +202,40 @@ def _by_turn(points: Floats, by_point: Floats, out: Floats) -> Floats:
 
 def _respond(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> tuple[Floats, Floats, Floats]:
     """Response (N,) under each edge, its derivative (3,N) by the point, the points (3,N), camera frame."""
+    count = len(batch)
+    value, by_point, points = np.empty(count), np.empty((3, count)), np.empty((3, count))
+    for first in range(0, count, _BLOCK):
+        block = slice(first, first + _BLOCK)
+        value[block] = _responded(batch, T_cam_lidar, level, block, (by_point[:, block], points[:, block]))
+    return value, by_point, points
+
+
+_BLOCK = 16384
+"""Edges worked on at once: what is worked out on the way takes some 400 bytes for each."""
+
+
+def _responded(
+    batch: EdgeBatch, T_cam_lidar: Floats, level: int, block: slice, out: tuple[Floats, Floats]
+) -> Floats:
+    """Response of the edges in a ``block``; derivatives and points go to ``out``."""
+    by_point, points = out
     R = T_cam_lidar[:3, :3]
-    points = R @ batch.position.T + T_cam_lidar[:3, 3:]
+    np.add(R @ batch.position[block].T, T_cam_lidar[:3, 3:], out=points)
     uv, valid, xy, A = cameras.project_with_slopes(batch.camera, points.T)
-    turned = R @ batch.direction.T
+    turned = R @ batch.direction[block].T
     # The step along the direction, times the depth: its angle is all that is asked for.
     step = turned[:2] - xy.T * turned[2]
     angle = np.arctan2(
         A[:, 1, 0] * step[0] + A[:, 1, 1] * step[1], A[:, 0, 0] * step[0] + A[:, 0, 1] * step[1]
     )
-    value, slope = sample(batch.images[level], batch.slot, uv, angle, batch.scales[level])
+    value, slope = sample(batch.images[level], batch.slot[block], uv, angle, batch.scales[level])
     if not valid.all():
         value, slope = np.where(valid, value, 0.0), np.where(valid[:, None], slope, 0.0)
-    by_point = np.empty_like(points)
     by_point[0] = slope[:, 0] * A[:, 0, 0] + slope[:, 1] * A[:, 1, 0]
     by_point[1] = slope[:, 0] * A[:, 0, 1] + slope[:, 1] * A[:, 1, 1]
     by_point[2] = -(by_point[0] * xy[:, 0] + by_point[1] * xy[:, 1])
     by_point /= np.where(valid, points[2], 1.0)
-    return value, by_point, points
+    return value
 
 
 def score_only(batch: EdgeBatch, T_cam_lidar: Floats, level: int) -> Floats:
@@ -253,11 +269,25 @@ def _by_frame_and_extrinsic(seen: EdgeBatch, values: Floats, extrinsics: int) ->
     return np.asarray(sums, dtype=np.float64).reshape(frames, extrinsics)
 
 
+def _parts(batch: EdgeBatch, extrinsics: int) -> Iterator[EdgeBatch]:
+    """The batch by its frames, in their order, so few at once as are quickly seen from so many extrinsics."""
+    edges = np.bincount(batch.slot, minlength=len(batch.stamps_ns))
+    part = (np.cumsum(edges) - edges) * extrinsics // _SEEN_AT_ONCE
+    for number in np.unique(part):
+        yield batch.of_frames(np.flatnonzero(part == number).tolist())
+
+
+_SEEN_AT_ONCE = 4 * _BLOCK
+"""Edges under all of the extrinsics together that :func:`seen_from` makes, of some frames: 10 MB."""
+
+
 def mean_responses(batch: EdgeBatch, extrinsics: Sequence[Floats]) -> Floats:
     """Weighted mean response of each frame under each extrinsic, (F,K)."""
-    seen = seen_from(batch, extrinsics)
-    weighted = score_only(seen, np.eye(4), 0)
-    return _by_frame_and_extrinsic(seen, weighted, len(extrinsics)) / batch.weights()[:, None]
+    sums = []
+    for part in _parts(batch, len(extrinsics)):
+        seen = seen_from(part, extrinsics)
+        sums.append(_by_frame_and_extrinsic(seen, score_only(seen, np.eye(4), 0), len(extrinsics)))
+    return np.concatenate(sums) / batch.weights()[:, None]
 
 
 def curvatures(batch: EdgeBatch, T_cam_lidar: Floats, difference: float) -> Floats:
@@ -269,8 +299,13 @@ def curvatures(batch: EdgeBatch, T_cam_lidar: Floats, difference: float) -> Floa
         difference: Step to both sides, alert units.
     """
     steps = np.concatenate([np.eye(6), -np.eye(6)]) * difference * UNITS
-    seen = seen_from(batch, [se3.retract(T_cam_lidar, step) for step in steps])
-    share = score(seen, np.eye(4), 0)[2] * seen.weight.sum() * UNITS
-    sums = np.stack([_by_frame_and_extrinsic(seen, column, len(steps)) for column in share.T], axis=2)
+    places, parts = [se3.retract(T_cam_lidar, step) for step in steps], []
+    for part in _parts(batch, len(steps)):
+        seen = seen_from(part, places)
+        share = score(seen, np.eye(4), 0)[2] * seen.weight.sum() * UNITS
+        parts.append(
+            np.stack([_by_frame_and_extrinsic(seen, column, len(steps)) for column in share.T], axis=2)
+        )
+    sums = np.concatenate(parts)
     H = (sums[:, 6:] - sums[:, :6]) / (2.0 * difference * batch.weights()[:, None, None])
     return np.asarray(0.5 * (H + H.transpose(0, 2, 1)), dtype=np.float64)

@@ -176,8 +176,9 @@ def sample(
         np.add(index[0], offset, out=index[tap])
         np.add(index[4], offset, out=index[4 + tap])
     read = np.empty((8, len(x)))
-    bounds = np.searchsorted(slot, np.arange(len(images) + 1)).tolist()
-    for image, begin, end in zip(images, bounds[:-1], bounds[1:], strict=True):
+    seen = slice(int(slot[0]), int(slot[-1]) + 1) if len(slot) else slice(0, 0)
+    bounds = np.searchsorted(slot, np.arange(seen.start, seen.stop + 1)).tolist()
+    for image, begin, end in zip(images[seen], bounds[:-1], bounds[1:], strict=True):
         read[:, begin:end] = image.reshape(-1).take(index[:, begin:end])
     taps = read[:4] + fo * (read[4:] - read[:4])
     taps /= COUNTS

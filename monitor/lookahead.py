@@ -99,14 +99,17 @@ class Forerunner:
     def serve(self, watches: Mapping[str, Watch]) -> None:
         """Names those who will judge, by name of the pair; before the first pair."""
         self._watches = watches
-        self._equip()
+        if self._lookout is not None:
+            self._equip(self._lookout)
+            # It may still be beginning: what is asked waits for it, and this process for the first answer.
+            for name in watches:
+                self._look_from_here(self._lookout, name)
 
     def see(self, pair: FramePair) -> None:
         """A pair that will come to its turn."""
         self._seen += 1
         if self._lookout is None and self._seen == _WORTH_A_PROCESS:
-            self._begin()
-            self._equip()
+            self._equip(self._begin())
         number = None
         if self._lookout is not None and self._holds(pair.pair):
             number = self._lookout.ask(pair)
@@ -131,9 +134,7 @@ class Forerunner:
         """The turn of a pair is over: what was found ahead of something that was forgotten is begun anew."""
         if self._holds(name) or self._lookout is None or not self._lookout.ready():
             return
-        watch = self._watches[name]
-        self._lookout.begin(name, watch.scout())
-        self._breaks[name] = watch.breaks
+        self._look_from_here(self._lookout, name)
         pending = self._pending[name]
         self._pending[name] = deque((pair, self._lookout.ask(pair)) for pair, _ in pending)
 
@@ -143,19 +144,24 @@ class Forerunner:
             self._lookout.close()
         self._threads.close()
 
-    def _begin(self) -> None:
+    def _begin(self) -> Lookout:
         self._lookout = Lookout()
         # Two processes have two cores to themselves.
         self._threads.enter_context(one_thread())
+        return self._lookout
 
-    def _equip(self) -> None:
-        if self._lookout is not None:
-            self._lookout.equip(
-                {
-                    name: (watch.mount, watch.parameters, watch.segmenter)
-                    for name, watch in self._watches.items()
-                }
-            )
+    def _equip(self, lookout: Lookout) -> None:
+        watches = self._watches.items()
+        lookout.equip({name: (watch.mount, watch.parameters, watch.segmenter) for name, watch in watches})
+        for watch in self._watches.values():
+            if watch.segmenter is not None:
+                watch.segmenter.rest()
+
+    def _look_from_here(self, lookout: Lookout, name: str) -> None:
+        """The pairs of this name that follow are looked at by a scout that goes on from where this one is."""
+        watch = self._watches[name]
+        lookout.begin(name, watch.scout())
+        self._breaks[name] = watch.breaks
 
     def _holds(self, name: str) -> bool:
         """Whether what is found ahead is what will be asked for."""

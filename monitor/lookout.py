@@ -81,6 +81,8 @@ class Lookout:
     def answer(self, number: int) -> Seen | None:
         """Waits for what was found in a pair; None where it failed, or has failed before."""
         found: Seen | None = None
+        if not self._there:
+            self._there = self._heard({}) is not None
         while self._asked and self._asked[0][0] <= number:
             asked, pair = self._asked.popleft()
             answer = self._heard({**self._known, **_arrays(pair)})

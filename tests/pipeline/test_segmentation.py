@@ -55,6 +55,13 @@ def test_model_of_another_contract_is_refused(key):
         Segmenter(onnx_bytes.block_means({k: v for k, v in CONTRACT.items() if k != key}))
 
 
+def test_a_session_that_rests_answers_as_before(shipped):
+    image = np.random.default_rng(3).integers(0, 256, (96, 160, 3), dtype=np.uint8)
+    before = shipped.probabilities(image)
+    shipped.rest()
+    assert np.array_equal(shipped.probabilities(image), before)
+
+
 def test_model_with_another_number_of_classes_is_refused():
     with pytest.raises(ModelError, match="inputs and outputs"):
         Segmenter(onnx_bytes.block_means(CONTRACT, classes=6))

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import ndtr
-from scipy.stats import chi, chi2
+from scipy.special import chdtrc, gammaln, ndtr
 
 _POINTS = 400
 """Parts of the integral over lengths; twice as many change the chance by less than 1e-4 of itself."""
@@ -71,7 +70,11 @@ def chance_per_scene(level: float, dimensions: int, longest: int) -> float:
     a = math.sqrt(level)
     x = np.linspace(a / math.sqrt(max(longest, 1)), a, _POINTS)
     integral = float(np.trapezoid(x * _overshoot(x) ** 2, x))
-    return float(chi2.sf(level, dimensions) + 0.5 * a * chi.pdf(a, dimensions) * integral)
+    half = 0.5 * dimensions
+    density = math.exp(
+        (dimensions - 1) * math.log(a) - 0.5 * level - (half - 1.0) * math.log(2.0) - gammaln(half)
+    )
+    return float(chdtrc(dimensions, level) + 0.5 * a * density * integral)
 
 
 def _overshoot(x: np.ndarray) -> np.ndarray:

@@ -68,8 +68,8 @@ def test_a_stop_while_it_simulates_leaves_no_drive(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_demo_shows_what_it_promises(calibwatch, tmp_path, seed):
-    code, out, _ = calibwatch("demo", "--out", tmp_path, "--seed", seed)
-    assert code == 0, out
+    code, out, err = calibwatch("demo", "--out", tmp_path, "--seed", seed)
+    assert code == 0, out + err
     assert f"{demo.DRIFT_S:6.2f} s  TRUTH" in out
     for name in ("report.html", "recording.rrd", "drive.mcap"):
         assert (tmp_path / name).exists()

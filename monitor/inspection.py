@@ -6,75 +6,34 @@ first sweeps and images decoded. Nothing is guessed: what was not looked at, or 
 
 import itertools
 import statistics
-from array import array
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from monitor.baseline_file import with_baselines
-from monitor.daemon import mount_of
-from monitor.discovery import TF_TYPES, Survey, discover, survey_in
+from monitor.discovery import Survey, discover, survey_in
 from monitor.inspection_report import (
     CloudReport,
     ImageReport,
     Inspection,
     Link,
-    PairReport,
     Span,
     TopicReport,
 )
-from monitor.messages import CameraInfo, Message, decode
-from monitor.messages.header import header_stamp_ns
+from monitor.pair_inspection import pair_report
 from monitor.preparation import prepare
-from monitor.rig import Rig, RigPair, camera_from_info, is_cloud, load_rig
-from monitor.sources import Source, Tick, TopicInfo, kinds, open_source
+from monitor.rig import Rig, RigPair, camera_from_info, load_rig
+from monitor.seen_topics import NONE, Seen, read_through
+from monitor.sources import TopicInfo, kinds, open_source
 from monitor.sources.kitti_raw import NOMINAL_PERIOD_NS
-from monitor.sync import middle_ns, pairer_for
-from monitor.wording import spin_warning
-from pipeline.cameras import project
+from monitor.sync import middle_ns
 from pipeline.errors import CalibwatchError, InputError
 from pipeline.records import CameraModel, PointCloud
 from pipeline.rings import scan_pattern
-from pipeline.se3 import apply, inverse
-from pipeline.spin_check import told_spin
 
-_SWEEPS = 5
-"""Sweeps per topic that are decoded: enough to tell a constant number of points from a changing one."""
-_TRANSFORMS = 1000
-"""tf messages that are decoded for the list of transforms: ten seconds at the usual 100 Hz."""
-_NONE = -1
-"""Stands for an absent number in arrays: hours of a fast topic must fit into memory."""
 _LIVE = "zenoh_live"
 """The kind of source that never ends."""
-
-
-@dataclass(slots=True)
-class _Seen:
-    """What was seen of one topic; the three arrays have one number per message, -1 where there is none."""
-
-    headers: "array[int]" = field(default_factory=lambda: array("q"))
-    logged: "array[int]" = field(default_factory=lambda: array("q"))
-    sequences: "array[int]" = field(default_factory=lambda: array("q"))
-    clouds: list[tuple[int, PointCloud, float | None]] = field(default_factory=list)
-    frame: str = ""
-    undecodable: str | None = None
-
-    def arrive(self, message: Message) -> None:
-        """Takes note of a message; what is beyond 64 bits is no stamp."""
-        for numbers, value in (
-            (self.headers, header_stamp_ns(message)),
-            (self.logged, message.log_ns),
-            (self.sequences, message.sequence),
-        ):
-            numbers.append(value if value is not None and 0 <= value < 1 << 63 else _NONE)
-
-    @property
-    def stamps(self) -> list[int]:
-        """Stamps as pairing sees them: of the header, else of the log."""
-        both = zip(self.headers, self.logged, strict=True)
-        return [log_ns if stamp in (0, _NONE) else stamp for stamp, log_ns in both]
 
 
 def inspect(location: str, rig_file: Path | None) -> Inspection:
@@ -94,10 +53,10 @@ def inspect(location: str, rig_file: Path | None) -> Inspection:
         topics, own = source.describe(), source.rig_document()
         survey = survey_in(source, topics)
     with open_source(location) as source:
-        seen, links = _read_through(source)
+        seen, links = read_through(source)
         losses = source.losses
     rig, how, missing = _rig(location, rig_file, survey, own=own is not None)
-    reports = tuple(_topic(topic, seen.get(topic.name, _Seen()), survey, rig) for topic in topics)
+    reports = tuple(_topic(topic, seen.get(topic.name, Seen()), survey, rig) for topic in topics)
     return Inspection(
         location=location,
         kind=kind,
@@ -106,7 +65,7 @@ def inspect(location: str, rig_file: Path | None) -> Inspection:
         transforms=tuple(
             Link(parent=t.parent, child=t.child, static=t.static) for t in links.transforms.values()
         ),
-        pairs=() if rig is None else tuple(_pair(p, how[p.name], seen, reports) for p in rig.pairs),
+        pairs=() if rig is None else tuple(pair_report(p, how[p.name], seen, reports) for p in rig.pairs),
         missing=missing,
         losses=dict(losses.counts),
         notes=tuple(losses.notes),
@@ -141,39 +100,10 @@ def _learned(pair: RigPair) -> tuple[str, ...]:
     return (f"baseline of {count} stretch{'es' if count != 1 else ''} of road",)
 
 
-def _read_through(source: Source) -> tuple[dict[str, _Seen], Survey]:
-    """Every topic, and the transforms."""
-    seen: dict[str, _Seen] = {}
-    links, left = Survey(), _TRANSFORMS
-    for message in source:
-        if isinstance(message, Tick):
-            continue
-        topic = seen.setdefault(message.topic, _Seen())
-        topic.arrive(message)
-        if is_cloud(message.type) and len(topic.clouds) < _SWEEPS and topic.undecodable is None:
-            _decode_cloud(message, topic)
-        if message.type in TF_TYPES and left > 0:
-            left -= 1
-            links.see(message)
-    return seen, links
-
-
-def _decode_cloud(message: Message, topic: _Seen) -> None:
-    try:
-        decoded = decode(message)
-    except InputError as error:
-        topic.undecodable = str(error)
-        return
-    for one in decoded:
-        if isinstance(one.value, PointCloud):
-            topic.frame = one.frame
-            topic.clouds.append((one.stamp_ns or message.log_ns, one.value, message.sweep_s))
-
-
-def _topic(topic: TopicInfo, seen: _Seen, survey: Survey, rig: Rig | None) -> TopicReport:
-    both = [pair for pair in zip(seen.headers, seen.logged, strict=True) if pair[0] != _NONE]
-    headers, logged = [stamp for stamp, _ in both], [log_ns for log_ns in seen.logged if log_ns != _NONE]
-    delays = [log_ns - stamp for stamp, log_ns in both if log_ns != _NONE]
+def _topic(topic: TopicInfo, seen: Seen, survey: Survey, rig: Rig | None) -> TopicReport:
+    both = [pair for pair in zip(seen.headers, seen.logged, strict=True) if pair[0] != NONE]
+    headers, logged = [stamp for stamp, _ in both], [log_ns for log_ns in seen.logged if log_ns != NONE]
+    delays = [log_ns - stamp for stamp, log_ns in both if log_ns != NONE]
     folder = topic.type.startswith("file/")
     return TopicReport(
         name=topic.name,
@@ -195,7 +125,7 @@ def _topic(topic: TopicInfo, seen: _Seen, survey: Survey, rig: Rig | None) -> To
     )
 
 
-def _cloud(seen: _Seen, topic: str, rig: Rig | None) -> CloudReport:
+def _cloud(seen: Seen, topic: str, rig: Rig | None) -> CloudReport:
     clouds = [cloud for _, cloud, _ in seen.clouds]
     first = next((cloud for cloud in clouds if len(cloud)), clouds[0])
     sizes = [len(cloud) for cloud in clouds]
@@ -245,7 +175,7 @@ def _intrinsics(
     """Intrinsics, which reading of them holds and why, and the topic that states them."""
     pair = next((p for p in (rig.pairs if rig else ()) if p.camera.topic == topic), None)
     info_topic = (pair.camera.info if pair else None) or survey.info_of(topic)
-    stated: CameraInfo | None = survey.infos[info_topic][1] if info_topic in survey.infos else None
+    stated = survey.infos[info_topic][1] if info_topic in survey.infos else None
     if stated is None:
         model = pair.camera.model if pair else None
         return model, None if model is None else "K and D: the rig states them", None
@@ -261,135 +191,6 @@ def _intrinsics(
 
 def _same(a: CameraModel, b: CameraModel) -> bool:
     return a.model == b.model and np.allclose(a.K, b.K) and np.array_equal(a.D, b.D)
-
-
-def _pair(pair: RigPair, how: str, seen: Mapping[str, _Seen], topics: Sequence[TopicReport]) -> PairReport:
-    """One pair with its gaps, view and problems. Topics and extrinsic of the pair are known."""
-    assert pair.T_cam_lidar is not None  # noqa: S101 - a prepared rig lacks nothing
-    lidar, camera = pair.lidar.topic or "", pair.camera.topic or ""
-    sweeps, images = seen.get(lidar, _Seen()), seen.get(camera, _Seen())
-    by_name = {topic.name: topic for topic in topics}
-    report = by_name[lidar].cloud
-    middle = 0 if report is None or report.middle_ms is None else round(report.middle_ms * 1e6)
-    same = by_name[camera].type.startswith("file/") and sorted(images.stamps) == sorted(sweeps.stamps)
-    gaps = _gaps(pair, sweeps, images, middle)
-    nearest = _nearest_ms([stamp + middle for stamp in sweeps.stamps], images.stamps)
-    in_view = _in_view(pair, sweeps)
-    T_lidar_cam = inverse(pair.T_cam_lidar)
-    return PairReport(
-        name=pair.name,
-        lidar=lidar,
-        camera=camera,
-        how=how.removeprefix(f"{lidar} with {camera}, "),
-        T_cam_lidar=pair.T_cam_lidar.tolist(),
-        camera_at_m=T_lidar_cam[:3, 3].tolist(),
-        looks_along=T_lidar_cam[:3, 2].tolist(),
-        vehicle_frame=pair.T_vehicle_lidar is not None,
-        sweeps=len(sweeps.logged),
-        images=len(images.logged),
-        pairs=len(gaps),
-        same_stamps=same,
-        gap_ms=statistics.median(gaps) if gaps and not same else None,
-        nearest_ms=nearest,
-        clock_offset_ms=_clock_offset_ms(by_name[lidar], by_name[camera]),
-        in_view=in_view,
-        problems=tuple(_problems(pair, by_name, len(gaps), nearest, in_view)),
-        warnings=_warnings(pair, sweeps),
-    )
-
-
-def _warnings(pair: RigPair, sweeps: _Seen) -> tuple[str, ...]:
-    """What the first sweeps say against the sense of rotation that the rig states."""
-    spin, clouds = pair.lidar.spin, sweeps.clouds
-    if spin is None or pair.camera.model is None or any(cloud.time is not None for _, cloud, _ in clouds):
-        return ()
-    told_s = next((sweep_s for _, _, sweep_s in clouds if sweep_s is not None), None)
-    told = told_spin([(stamp_ns, cloud) for stamp_ns, cloud, _ in clouds], told_s, mount_of(pair).up)
-    return () if told in (None, spin) else (spin_warning(told),)
-
-
-def _gaps(pair: RigPair, sweeps: _Seen, images: _Seen, middle: int) -> list[float]:
-    """Image stamp minus middle of the sweep, ms, of each pair; found as the monitor finds them."""
-    pairer = pairer_for(pair)
-    arrivals = [
-        (log_ns, side, stamp, None if sequence == _NONE else sequence)
-        for side, topic in (("camera", images), ("lidar", sweeps))
-        for stamp, log_ns, sequence in zip(topic.stamps, topic.logged, topic.sequences, strict=True)
-    ]
-    paired = []
-    for _, side, stamp, sequence in sorted(arrivals, key=lambda arrival: arrival[0]):
-        if side == "lidar":
-            paired += pairer.push_lidar(stamp + middle, None, sequence)
-        else:
-            paired += pairer.push_camera(stamp, None, sequence)
-    paired += pairer.flush()
-    return [(one.camera_ns - one.lidar_ns) / 1e6 for one in paired]
-
-
-def _clock_offset_ms(lidar: TopicReport, camera: TopicReport) -> float | None:
-    """How far the camera's clock is ahead of the LiDAR's if both take equally long from measuring to log.
-
-    A sweep is sent when it ends, which its stamp does not tell where its duration is unknown.
-    """
-    if lidar.delay_ms is None or camera.delay_ms is None or lidar.cloud is None:
-        return None
-    cloud = lidar.cloud
-    known = cloud.middle_ms is not None and cloud.sweep_s is not None
-    end_ms = (cloud.middle_ms or 0.0) + 500.0 * (cloud.sweep_s or 0.0) if known else 0.0
-    return lidar.delay_ms - end_ms - camera.delay_ms
-
-
-def _nearest_ms(sweeps: Sequence[int], images: Sequence[int]) -> float | None:
-    """Median of image stamp minus nearest sweep, ms; None where one of them is empty."""
-    if not sweeps or not images:
-        return None
-    order = np.sort(np.array(sweeps, dtype=np.int64))
-    stamps = np.array(images, dtype=np.int64)
-    after = (
-        np.clip(np.searchsorted(order, stamps), 1, len(order) - 1)
-        if len(order) > 1
-        else np.zeros_like(stamps)
-    )
-    before = np.maximum(after - 1, 0)
-    differences = np.stack([stamps - order[before], stamps - order[after]])
-    chosen = np.abs(differences).argmin(axis=0)
-    return float(np.median(differences[chosen, np.arange(len(stamps))])) / 1e6
-
-
-def _in_view(pair: RigPair, sweeps: _Seen) -> tuple[int, int] | None:
-    """Points of the first sweep that the stored extrinsic puts into the image, and all of them."""
-    cloud = next((cloud for _, cloud, _ in sweeps.clouds if len(cloud)), None)
-    if cloud is None or pair.camera.model is None or pair.T_cam_lidar is None:
-        return None
-    _, inside = project(pair.camera.model, apply(pair.T_cam_lidar, cloud.xyz))
-    return int(inside.sum()), len(cloud)
-
-
-def _problems(
-    pair: RigPair,
-    topics: Mapping[str, TopicReport],
-    pairs: int,
-    nearest: float | None,
-    in_view: tuple[int, int] | None,
-) -> list[str]:
-    """What will keep the pair from being judged."""
-    lidar, camera = topics[pair.lidar.topic or ""], topics[pair.camera.topic or ""]
-    found = [f"{topic.name}: {topic.undecodable}" for topic in (lidar, camera) if topic.undecodable]
-    found += [f"{topic.name} has no message" for topic in (lidar, camera) if topic.count == 0]
-    model = pair.camera.model
-    if camera.image is not None and model is not None and camera.image.size != (model.width, model.height):
-        width, height = camera.image.size
-        found.append(f"images are {width}x{height} px, the intrinsics are for {model.width}x{model.height}")
-    if pairs == 0 and nearest is not None:
-        found.append(
-            f"no sweep and image belong together: camera stamps are {nearest / 1e3:+.3f} s from the nearest "
-            f"sweep, the limit is {pair.max_gap_ns / 1e6:g} ms"
-        )
-    if in_view is not None and in_view[0] == 0:
-        found.append("no point of the first sweep falls into the image: is T_cam_lidar inverted?")
-    if lidar.cloud is not None and lidar.cloud.rings is None:
-        found.append("the clouds show no rings: only lines can be compared, no edges")
-    return found
 
 
 def _span(stamps: Sequence[int]) -> Span | None:

@@ -1,4 +1,4 @@
-"""Drives as trials tell them: in other words they stay true, and what is made wrong is wrong by what it says."""
+"""Drives as trials tell them: in other words they stay true, and what is wrong is wrong by what it says."""
 
 import dataclasses
 import math

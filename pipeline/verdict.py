@@ -6,6 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from pipeline import reasons
 from pipeline.drift_test import Judgement
 from pipeline.onset import Onset
 from pipeline.records import AXES, Floats
@@ -234,14 +235,18 @@ def _confirmed(
     """The memory with a drift that is sure, by windows in a row or by all scenes; None where none is."""
     if memory.alarms >= parameters.confirmations:
         onset = Onset(memory.quiet_ns, memory.quiet_from_ns, memory.stirred_ns)
-        drift, reason = judgement.drift, _drift_reason(judgement, limits)
+        drift, reason = judgement.drift, reasons.drift(judgement, limits)
     elif steady is not None and steady.alarming:
         # A sum over scenes is persistent by itself: none of them alone is heard for enough to alarm.
-        onset, drift, reason = steady.onset, steady.drift, _steady_reason("has moved", steady, limits)
+        onset, drift, reason = steady.onset, steady.drift, _over(steady, "has moved", limits)
     else:
         return None
     memory = dataclasses.replace(memory, onset=onset, severity=_severity(drift, limits))
     return _enter(memory, "drift_confirmed", reason, memory.input_ns)
+
+
+def _over(steady: Steady, claim: str, limits: Floats) -> str:
+    return reasons.over(steady.over, claim, (steady.drift, steady.sigma), limits)
 
 
 def _suspicion(judgement: Judgement, steady: Steady | None, limits: Floats) -> tuple[str, str]:
@@ -250,10 +255,10 @@ def _suspicion(judgement: Judgement, steady: Steady | None, limits: Floats) -> t
         reason = "Lines and edges contradict each other beyond their errors: nothing is claimed of the mount."
         return "witnesses_disagree", reason
     if judgement.suspicious or judgement.alarming:
-        size = _size(judgement, _worst(judgement, limits))
+        size = reasons.worst(judgement.drift, judgement.sigma, limits)
         return "evidence_of_drift", f"Evidence of drift is not yet sure: {size}."
     if steady is not None and steady.suspicious:
-        return "evidence_of_drift", _steady_reason("may have moved", steady, limits)
+        return "evidence_of_drift", _over(steady, "may have moved", limits)
     return "evidence_of_drift", ""
 
 
@@ -270,10 +275,10 @@ def _quiet(
     patient = now_ns - memory.monitored_ns < parameters.patience_ns
     if judgement.blind:
         keep = patient and memory.state in ("starting", "healthy")
-        return memory if keep else _enter(memory, *_blindness(judgement), now_ns)
+        return memory if keep else _enter(memory, *reasons.blindness(judgement), now_ns)
     monitored = [axis for axis in wanted if judgement.monitored[axis]]
     if len(monitored) < len(wanted) or not wanted:
-        reason = _unmonitored_reason(judgement, [a for a in wanted if a not in monitored])
+        reason = reasons.unmonitored(judgement, [a for a in wanted if a not in monitored])
         keep = patient and memory.state in ("starting", "healthy")
         return memory if keep else _enter(memory, "axes_not_monitored", reason, now_ns)
     beyond = judgement.observable & (np.abs(judgement.drift) > limits)
@@ -281,19 +286,14 @@ def _quiet(
         axis for axis in range(len(AXES)) if beyond[axis] or (axis in wanted and not judgement.excluded[axis])
     ]
     if doubtful:
-        names = " and ".join(_size(judgement, axis) for axis in doubtful)
+        names = " and ".join(
+            reasons.size(axis, float(judgement.drift[axis]), float(judgement.sigma[axis]))
+            for axis in doubtful
+        )
         reason = f"{names} may exceed its limit, but lies within the stored extrinsic's own uncertainty."
         return _enter(memory, "within_stored_uncertainty", reason, now_ns)
     named = ", ".join(AXES[a] for a in range(len(AXES)) if judgement.monitored[a] and judgement.excluded[a])
     return _enter(memory, "within_limits", f"Drift beyond the alert limits is excluded in {named}.", now_ns)
-
-
-def _blindness(judgement: Judgement) -> tuple[str, str]:
-    """Code and reason of a window in which nothing is seen."""
-    if judgement.ambiguous:
-        return "ambiguous", "Several extrinsics explain these scenes about as well: nothing tells them apart."
-    reason = "Image and cloud show nothing in common here (dark, blocked, or off by more than can be seen)."
-    return "nothing_in_common", reason
 
 
 def acknowledge(memory: Memory, now_ns: int, by: str, why: str) -> Memory:
@@ -325,9 +325,9 @@ def finish(memory: Memory, judgement: Judgement | None, frames: int, required: t
         return _enter(memory, "no_scan_pattern", reason, now_ns)
     few = f"{frames} frame{'s are' if frames != 1 else ' is'} too few for a verdict"
     if judgement.blind:
-        return _enter(memory, *_blindness(judgement), now_ns)
+        return _enter(memory, *reasons.blindness(judgement), now_ns)
     missing = [AXES.index(axis) for axis in required if not judgement.monitored[AXES.index(axis)]]
-    detail = _unmonitored_reason(judgement, missing) if missing else "no judgement was repeated often enough."
+    detail = reasons.unmonitored(judgement, missing) if missing else "no judgement was repeated often enough."
     return _enter(memory, "too_short", f"Too short: {few}; {detail}", now_ns)
 
 
@@ -390,36 +390,3 @@ def _severity(drift: Floats, limits: Floats) -> Literal["minor", "major"]:
 
 def _worse(a: Literal["minor", "major"], b: Literal["minor", "major"]) -> Literal["minor", "major"]:
     return "major" if "major" in (a, b) else "minor"
-
-
-def _worst(judgement: Judgement, limits: Floats) -> int:
-    return int(np.argmax(np.abs(judgement.drift) / limits))
-
-
-def _size(judgement: Judgement, axis: int) -> str:
-    return _size_of(axis, float(judgement.drift[axis]), float(judgement.sigma[axis]))
-
-
-def _size_of(axis: int, value: float, sigma: float) -> str:
-    if axis < 3:
-        return f"{AXES[axis]} {np.degrees(value):+.2f} deg (sigma {np.degrees(sigma):.2f})"
-    return f"{AXES[axis]} {value:+.3f} m (sigma {sigma:.3f})"
-
-
-def _drift_reason(judgement: Judgement, limits: Floats) -> str:
-    return f"The mount has moved: {_size(judgement, _worst(judgement, limits))}."
-
-
-def _steady_reason(claim: str, steady: Steady, limits: Floats) -> str:
-    axis = int(np.argmax(np.abs(steady.drift) / limits))
-    size = _size_of(axis, float(steady.drift[axis]), float(steady.sigma[axis]))
-    return f"Over {steady.over} the mount {claim}: {size}."
-
-
-def _unmonitored_reason(judgement: Judgement, axes: list[int]) -> str:
-    parts = []
-    for axis in axes:
-        level = float(judgement.protection_level[axis])
-        text = f"{np.degrees(level):.2f} deg" if axis < 3 else f"{level:.3f} m"
-        parts.append(f"{AXES[axis]} is known to {text} only")
-    return f"{' and '.join(parts)}, more than its alert limit." if parts else "No axis is required."

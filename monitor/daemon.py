@@ -197,9 +197,9 @@ def _feed(
     return arrival_ns
 
 
-def _unseen(pair: FramePair) -> None:
+def _unseen(pair: FramePair) -> FramePair:
     """Nobody looks ahead."""
-    del pair
+    return pair
 
 
 def _heed(watching_: Watching) -> None:

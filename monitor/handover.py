@@ -9,10 +9,12 @@ import os
 import pickle
 import socket
 import struct
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 _SHARED_BYTES = 1 << 18
 """Arrays from this size on are read where they lie, which keeps all of a message; smaller ones are copied."""
@@ -47,6 +49,33 @@ def give(end: socket.socket, value: object, known: Mapping[str, object]) -> None
     Raises:
         OSError: Nobody is there any more.
     """
+    file, sizes = _stored(value, known)
+    try:
+        _send(end, file, sizes)
+    finally:
+        os.close(file)
+
+
+def share(end: socket.socket, value: T, known: Mapping[str, object]) -> T:
+    """Hands a value over as :func:`give` does, and gives what the other side receives.
+
+    Large arrays of it lie in the memory of both, once.
+    """
+    file, sizes = _stored(value, known)
+    try:
+        _send(end, file, sizes)
+        same: T = _loaded(file, sizes, known)
+    finally:
+        os.close(file)
+    return same
+
+
+def _send(end: socket.socket, file: int, sizes: Sequence[int]) -> None:
+    socket.send_fds(end, [struct.pack(f"<{len(sizes)}q", *sizes)], [file])
+
+
+def _stored(value: object, known: Mapping[str, object]) -> tuple[int, list[int]]:
+    """A file in memory that holds the value, and the sizes of its parts."""
     shared: list[memoryview] = []
 
     def lies_in_message(buffer: Buffer) -> bool:
@@ -64,10 +93,10 @@ def give(end: socket.socket, value: object, known: Mapping[str, object]) -> None
         for part in parts:
             _write(file, part)
             _write(file, memoryview(bytes(-part.nbytes % _ALIGNED)))
-        note = struct.pack(f"<{len(parts)}q", *(part.nbytes for part in parts))
-        socket.send_fds(end, [note], [file])
-    finally:
+    except OSError:
         os.close(file)
+        raise
+    return file, [part.nbytes for part in parts]
 
 
 def receive(end: socket.socket, known: Mapping[str, object]) -> Any:  # noqa: ANN401 - what was given
@@ -80,11 +109,16 @@ def receive(end: socket.socket, known: Mapping[str, object]) -> Any:  # noqa: AN
     if not note:
         raise EOFError
     try:
-        memory = memoryview(mmap.mmap(files[0], 0, access=mmap.ACCESS_READ))
+        return _loaded(files[0], struct.unpack(f"<{len(note) // 8}q", note), known)
     finally:
         os.close(files[0])
+
+
+def _loaded(file: int, sizes: Sequence[int], known: Mapping[str, object]) -> Any:  # noqa: ANN401 - what was stored
+    """The value that a file in memory holds; large arrays are read where they lie."""
+    memory = memoryview(mmap.mmap(file, 0, access=mmap.ACCESS_READ))
     parts, begin = [], 0
-    for size in struct.unpack(f"<{len(note) // 8}q", note):
+    for size in sizes:
         parts.append(memory[begin : begin + size])
         begin += size + -size % _ALIGNED
     return _Reader(io.BytesIO(parts[0]), known, parts[1:]).load()

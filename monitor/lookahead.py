@@ -46,11 +46,11 @@ class Ahead:
 
 
 def arrivals(
-    messages: Iterable[Message | Tick], intake: Intake, most: int, see: Callable[[FramePair], None]
+    messages: Iterable[Message | Tick], intake: Intake, most: int, see: Callable[[FramePair], FramePair]
 ) -> Iterator[Arrival]:
-    """What comes, in its order; read on until ``most`` pairs wait, each shown to ``see`` as it is completed.
+    """What comes, in its order; read on until ``most`` pairs wait.
 
-    A source that fails does so after all that came before has been given.
+    A pair is shown to ``see`` when it is completed, and kept as that gives it. A source that fails does so after all that came before has been given.
     """
     waiting: deque[Arrival] = deque()
     pairs, source, failed = 0, iter(messages), None
@@ -62,9 +62,7 @@ def arrivals(
         except CalibwatchError as error:
             failed = error
             break
-        found = tuple(intake.take(item)) if isinstance(item, Message) else ()
-        for pair in found:
-            see(pair)
+        found = tuple(see(pair) for pair in intake.take(item)) if isinstance(item, Message) else ()
         arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
         waiting.append(Arrival(arrival_ns, found, intake.accounts(), len(intake.notes)))
         pairs += len(found)
@@ -105,15 +103,16 @@ class Forerunner:
             for name in watches:
                 self._look_from_here(self._lookout, name)
 
-    def see(self, pair: FramePair) -> None:
-        """A pair that will come to its turn."""
+    def see(self, pair: FramePair) -> FramePair:
+        """A pair that will come to its turn; gives it as it is to be kept until then."""
         self._seen += 1
         if self._lookout is None and self._seen == _WORTH_A_PROCESS:
             self._equip(self._begin())
         number = None
         if self._lookout is not None and self._holds(pair.pair):
-            number = self._lookout.ask(pair)
+            pair, number = self._lookout.ask(pair)
         self._pending.setdefault(pair.pair, deque()).append((pair, number))
+        return pair
 
     def take(self, pair: FramePair) -> Ahead | None:
         """What was found in the pair whose turn it is; None where it has to be looked at now."""
@@ -136,7 +135,8 @@ class Forerunner:
             return
         self._look_from_here(self._lookout, name)
         pending = self._pending[name]
-        self._pending[name] = deque((pair, self._lookout.ask(pair)) for pair, _ in pending)
+        # They come to their turn as they were kept before.
+        self._pending[name] = deque((pair, self._lookout.ask(pair)[1]) for pair, _ in pending)
 
     def close(self) -> None:
         """Ends the process; what it still had to do is left."""

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from monitor.clock import SystemClock
-from monitor.handover import give, link, receive
+from monitor.handover import give, link, receive, share
 from monitor.memory import keep_freed
 from monitor.threads import one_thread
 from pipeline.frame_evidence import FrameEvidence, Scout
@@ -71,12 +71,16 @@ class Lookout:
         """The pairs of this name that follow are looked at by this scout."""
         self._tell((name, scout), self._known)
 
-    def ask(self, pair: FramePair) -> int:
-        """Gives it a pair to look at; the number of the question."""
+    def ask(self, pair: FramePair) -> tuple[FramePair, int]:
+        """Gives it a pair to look at: the pair as both have it, and the number of the question."""
+        if not self._lost:
+            try:
+                pair = share(self._end, pair, {})
+            except OSError:
+                self._lost = True
         self._count += 1
         self._asked.append((self._count, pair))
-        self._tell(pair, {})
-        return self._count
+        return pair, self._count
 
     def answer(self, number: int) -> Seen | None:
         """Waits for what was found in a pair; None where it failed, or has failed before."""

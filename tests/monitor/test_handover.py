@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from monitor.handover import give, link, receive
+from monitor.handover import give, link, receive, share
 from monitor.model_file import model_bytes
 from pipeline.records import PointCloud
 from pipeline.segmentation import Segmenter
@@ -47,6 +48,33 @@ def test_large_arrays_arrive(order):
     np.testing.assert_array_equal(first, value)
     np.testing.assert_array_equal(second, value[:7])
     assert text == "between"
+
+
+def test_what_is_shared_lies_in_the_memory_of_both_once():
+    rng = np.random.default_rng(4)
+    large, small = rng.normal(size=(70_001, 6)), rng.normal(size=7)
+    ours, theirs = link()
+    with ours, theirs:
+        kept = share(ours, {"large": large, "small": small}, {})
+        found = receive(theirs, {})
+    for one in (kept, found):
+        np.testing.assert_array_equal(one["large"], large)
+        np.testing.assert_array_equal(one["small"], small)
+    assert not np.shares_memory(kept["large"], large)
+    # The same page of the same file under both addresses.
+    places = [open_file_at(one["large"].__array_interface__["data"][0]) for one in (kept, found)]
+    assert places[0] == places[1]
+
+
+def open_file_at(address):
+    """Inode of the file in memory that is mapped at an address, and the offset there."""
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        span, _, offset, _, inode, *_ = line.split()
+        begin, end = (int(text, 16) for text in span.split("-"))
+        if begin <= address < end:
+            assert int(inode) > 0
+            return inode, int(offset, 16) + address - begin
+    raise AssertionError("mapped nowhere")
 
 
 def test_what_the_other_side_has_is_named():

@@ -215,9 +215,9 @@ def test_what_a_process_fails_at_is_met_here(rig, messages, looked_at, monkeypat
     def spoilt(self, pair):
         # A pair that no scout can look at arrives over there.
         give = dataclasses.replace(pair, cloud_stamp_ns=None) if self._count == 3 else pair
-        number = ask(self, give)
+        _, number = ask(self, give)
         self._asked[-1] = (number, pair)
-        return number
+        return pair, number
 
     monkeypatch.setattr(Lookout, "ask", spoilt)
     assert told_of(rig, stream, 5) == plainly
@@ -260,13 +260,18 @@ def test_a_source_that_fails_does_so_after_what_came_before(rig, messages):
 def test_arrivals_keep_their_order_and_their_accounts(rig, messages):
     stream = [*items(drives.first_frames(messages, 9)), Tick(5)]
     live, shown = Intake(rig), []
+
+    def noted(pair, notes):
+        notes.append(pair)
+        return pair
+
     plainly = [
         (one.arrival_ns, one.pairs, one.accounts, one.notes)
-        for one in arrivals(stream, live, 0, shown.append)
+        for one in arrivals(stream, live, 0, lambda pair: noted(pair, shown))
     ]
     assert [arrival_ns for arrival_ns, *_ in plainly] == [*(message.log_ns for message in stream[:-1]), 5]
     seen, ahead, most = [], [], 0
-    for arrival in arrivals(stream, Intake(rig), 4, seen.append):
+    for arrival in arrivals(stream, Intake(rig), 4, lambda pair: noted(pair, seen)):
         ahead.append(arrival)
         most = max(most, len(seen) - sum(len(one.pairs) for one in ahead[:-1]))
     assert [one.arrival_ns for one in ahead] == [arrival_ns for arrival_ns, *_ in plainly]

@@ -50,7 +50,8 @@ def arrivals(
 ) -> Iterator[Arrival]:
     """What comes, in its order; read on until ``most`` pairs wait.
 
-    A pair is shown to ``see`` when it is completed, and kept as that gives it. A source that fails does so after all that came before has been given.
+    A pair is shown to ``see`` when it is completed, and kept as that gives it. A source that fails does so
+    after all that came before has been given.
     """
     waiting: deque[Arrival] = deque()
     pairs, source, failed = 0, iter(messages), None

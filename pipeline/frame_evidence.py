@@ -109,6 +109,7 @@ class Scout:
         self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
         self._seat: SensorSeat | None = None
         self._lines_at: tuple[int, float] | None = None
+        self._barren = False
         self._count = 0
 
     @property
@@ -158,6 +159,8 @@ class Scout:
             masks, lines = self._lines_of(pair, ground, rng, stage)
         enough = edges if edges is not None and len(edges) >= _LEAST_EDGES else None
         found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
+        if lines is not None:
+            self._barren = not found_lines
         dropped: DropReason | None = None
         if enough is None and not found_lines:
             dropped = "no_scan_pattern" if edges is None else "no_edges"
@@ -171,7 +174,7 @@ class Scout:
             waited_ns = now_ns - self._lines_at[0]
             way_m = None if straight.twist is None else straight.distance_m - self._lines_at[1]
         every_ns = self._parameters.lines_every_ns
-        due = window.lines_due(waited_ns, way_m, every_ns, self._parameters.window)
+        due = window.lines_due(waited_ns, way_m, every_ns, self._parameters.window, barren=self._barren)
         if self._segmenter is None or not due:
             return False
         self._lines_at = (now_ns, straight.distance_m)

@@ -53,6 +53,8 @@ class WindowParameters:
         beginning_ns: How long the beginning lasts: recordings of incidents may be as short.
         lines_seldom_ns: Time between frames that get lines while the vehicle stands: traffic uncovers others.
         lines_way_m: Way after which lines show something new: a dash of 3 m.
+        lines_barren_ns: Time between frames that get lines while the last of them showed none to match: the
+            budget is kept for where paint and poles are; the first that comes up waits no longer than this.
     """
 
     most_frames: int = 20
@@ -72,6 +74,7 @@ class WindowParameters:
     beginning_ns: int = 1_200_000_000
     lines_seldom_ns: int = 2 * _NS
     lines_way_m: float = 3.0
+    lines_barren_ns: int = 1 * _NS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,7 +178,7 @@ def judgement_due(
 
 
 def lines_due(
-    waited_ns: int | None, way_m: float | None, every_ns: int, parameters: WindowParameters
+    waited_ns: int | None, way_m: float | None, every_ns: int, parameters: WindowParameters, *, barren: bool
 ) -> bool:
     """Whether a frame should get masks and lines: the budget allows it, and they would show something new.
 
@@ -184,9 +187,11 @@ def lines_due(
         way_m: Way driven since, m, or None where the motion is not known.
         every_ns: Time between such frames that the budget allows.
         parameters: See there.
+        barren: Whether the last frame that got them had none in its cloud, or none in its image.
     """
     if waited_ns is None:
         return True
     new = way_m is None or way_m >= parameters.lines_way_m
-    wait = every_ns if new else max(every_ns, parameters.lines_seldom_ns)
+    wait = max(every_ns, parameters.lines_barren_ns) if barren else every_ns
+    wait = wait if new else max(wait, parameters.lines_seldom_ns)
     return waited_ns >= wait - wait // 10

@@ -209,9 +209,36 @@ def test_jitter_of_a_10_hz_sensor_costs_no_frame_of_waiting():
     ],
 )
 def test_lines_are_asked_of_what_is_new_within_the_budget(waited_ns, way_m, due):
-    assert lines_due(waited_ns, way_m, S // 2, P) == due
+    assert lines_due(waited_ns, way_m, S // 2, P, barren=False) == due
 
 
 def test_a_budget_below_the_seldom_rhythm_is_kept_while_standing():
-    assert not lines_due(4 * S, 0.0, 5 * S, P)
-    assert lines_due(5 * S, 0.0, 5 * S, P)
+    assert not lines_due(4 * S, 0.0, 5 * S, P, barren=False)
+    assert lines_due(5 * S, 0.0, 5 * S, P, barren=False)
+
+
+def asked(shows, every_ns=S // 2, seconds=20, way_m=1.0):
+    """Stamps at which frames of a 10 Hz drive get lines, where ``shows`` tells whether there are any."""
+    stamps, barren = [], False
+    for now in range(0, seconds * S, TENTH):
+        waited, way = (now - stamps[-1], way_m * (now - stamps[-1]) / TENTH) if stamps else (None, None)
+        if lines_due(waited, way, every_ns, P, barren=barren):
+            stamps.append(now)
+            barren = not shows(now)
+    return stamps
+
+
+def test_frames_that_show_lines_are_preferred():
+    """Half of the road is bare: twice as many are taken of the other half, from its first second on."""
+    town = asked(lambda now: now // (5 * S) % 2 == 1)
+    gaps = [(now, later - now) for now, later in itertools.pairwise(town)]
+    barren = 9 * TENTH
+    assert {gap for now, gap in gaps if S <= now % (10 * S) < 4 * S} == {barren}
+    assert {gap for now, gap in gaps if 6 * S <= now % (10 * S) < 9 * S} == {S // 2}
+    where = [now // (5 * S) % 2 for now in town]
+    assert where.count(1) > 1.5 * where.count(0)
+    # Bounded both ways: the budget where all is paint, and never silent where nothing is.
+    assert set(np.diff(asked(lambda _: True))) == {S // 2}
+    assert set(np.diff(asked(lambda _: False))) == {barren}
+    assert set(np.diff(asked(lambda _: False, way_m=0.0))) == {18 * TENTH}
+    assert set(np.diff(asked(lambda _: False, every_ns=3 * S))) == {27 * TENTH}

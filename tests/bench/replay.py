@@ -84,9 +84,9 @@ def _children() -> list[int]:
 def table(runs: dict[str, Replayed]) -> str:
     """The replays as Markdown."""
     lines = [
-        "### Replay, all stages and outputs",
+        "### Replay, all stages and outputs; memory of each process, and of both at once",
         "",
-        "| recording | frames | wall, s | process, s | beside, s | a frame, ms | memory, together, MB | verdict |",
+        "| recording | frames | wall, s | process, s | beside, s | a frame, ms | memory, MB | verdict |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, run in runs.items():

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from importlib import resources
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline import se3
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import CameraImage, CameraModel, FramePair, PointCloud
+from pipeline.segmentation import Segmenter
 from pipeline.simulation.drive import Drive, DriveParameters
 from pipeline.simulation.lidar import spinning
 from pipeline.simulation.scene import SceneParameters
@@ -199,3 +201,29 @@ def test_the_verdict_does_not_depend_on_which_frames_were_skipped():
         for pattern, judgement in judgements.items():
             off = np.abs(judgement.drift - judgements["all"].drift)
             assert (off < 2.0 * judgement.sigma).all(), pattern
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn_deg", [0.0, 1.0])
+def test_the_verdict_does_not_depend_on_which_frames_got_lines(turn_deg):
+    """Each, some, few, and at other moments: states end alike, and estimates agree within their sigma."""
+    parameters, pairs = drive()
+    segmenter = Segmenter((resources.files("models") / "bisenetv2.onnx").read_bytes(), threads=1)
+    xi = np.array([0.0, math.radians(turn_deg), 0.0, 0.0, 0.0, 0.0])
+    judgements, ends, counts = [], [], []
+    for every_ns, first in ((TENTH, 0), (5 * TENTH, 0), (5 * TENTH, 3), (12 * TENTH, 0)):
+        settings = Parameters(lines_every_ns=every_ns)
+        watch, states = Watch(mount_of(parameters, xi), settings, segmenter), []
+        for pair in pairs[first:]:
+            watch.step(pair)
+            states.append(watch.memory.state)
+        watch.finish()
+        judgements.append(watch.belief.judgement)
+        ends.append(watch.memory.state)
+        counts.append(len(watch.line_stamps))
+        assert not ({"healthy"} if turn_deg else {"suspect", "drifted"}) & set(states)
+    assert counts[0] > counts[1] > counts[3] > 0
+    assert len(set(ends)) == 1
+    for judgement in judgements[1:]:
+        off = np.abs(judgement.drift - judgements[0].drift)
+        assert (off < 2.0 * judgement.sigma).all()

@@ -9,7 +9,7 @@ import numpy as np
 
 from monitor.daemon import extrinsic_hash, mount_of
 from monitor.intake import Intake, pairs_of
-from monitor.model_file import model_bytes
+from monitor.model_file import open_segmenter
 from monitor.preparation import prepare
 from monitor.sources import open_source
 from monitor.statements import TO_PEOPLE
@@ -70,7 +70,7 @@ def learn_baselines(
         CalibwatchError: A recording can not be read, is not healthy, or does not go with the others.
         KeyboardInterrupt: ``stop`` was set: half the recordings make another baseline.
     """
-    segmenter = Segmenter(model_bytes(model))
+    segmenter = open_segmenter(model)
     names = _names(recordings)
     mounts: dict[str, Mount] = {}
     drives: dict[str, list[Drive]] = {}

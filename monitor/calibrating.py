@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from monitor.daemon import extrinsic_hash, mount_of
 from monitor.intake import Intake, pairs_of
-from monitor.model_file import model_bytes
+from monitor.model_file import open_segmenter
 from monitor.preparation import prepare
 from monitor.refusal import Account, drop_notes, refuse_unusable
 from monitor.rig import Rig, load_rig
@@ -28,7 +28,6 @@ from pipeline.frame_modes import Prior
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import Floats, FramePair
-from pipeline.segmentation import Segmenter
 
 FOUND = Prior(sigma_rad=math.radians(1.5), sigma_m=0.25)
 """How far off a first guess is that was found with no stored extrinsic: 95 of 100 within 3 deg, 0.5 m."""
@@ -103,7 +102,7 @@ def calibrate(
     if guesses is not None:
         rig = _guessed(rig, guesses)
     truth = {} if reference is None else _truth(reference, rig)
-    segmenter = Segmenter(model_bytes(model))
+    segmenter = open_segmenter(model)
     calibrators = {
         pair.name: Calibrator(
             mount_of(pair), Parameters(), segmenter, settings(found=pair.name in found, stored=prior)

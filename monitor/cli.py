@@ -15,6 +15,7 @@ from typing import NoReturn
 
 import click
 
+from monitor.commands import NamingGroup
 from pipeline.errors import CalibwatchError
 
 COMMANDS = {
@@ -35,7 +36,7 @@ BAD_INPUT, INTERRUPTED = 1, 130
 """Exit codes; wrong usage is click's 2, those of verdicts stand in monitor.status."""
 
 
-class _Commands(click.Group):
+class _Commands(NamingGroup):
     """Commands by name, imported when called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -56,16 +57,6 @@ class _Commands(click.Group):
         del ctx
         with formatter.section("Commands"):
             formatter.write_dl(sorted(COMMANDS.items()))
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """A misspelt command names the nearest one."""
-        if args and not args[0].startswith("-") and args[0] not in COMMANDS:
-            from monitor.rig_document import nearest  # noqa: PLC0415 - pydantic is not needed for --help
-
-            ctx.fail(f"no command '{args[0]}' ({nearest(args[0], sorted(COMMANDS))})")
-        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
         """Runs the command; that a pipe between our own processes broke is not taken for a reader that left.

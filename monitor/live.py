@@ -14,7 +14,7 @@ from monitor.command_bus import CommandBus
 from monitor.daemon import watch, watching
 from monitor.discovery import Survey, survey_in
 from monitor.messages import Message
-from monitor.model_file import model_bytes
+from monitor.model_file import open_segmenter
 from monitor.outputs import Surroundings, open_outputs
 from monitor.preparation import completed
 from monitor.rig import CLOUD_TYPES, IMAGE_TYPES, Rig, load_rig
@@ -23,7 +23,6 @@ from monitor.sources.zenoh_live import ZenohLive, subscriptions
 from monitor.status import State
 from pipeline.errors import InputError, RigError
 from pipeline.parameters import Parameters
-from pipeline.segmentation import Segmenter
 
 _log = logging.getLogger(__name__)
 
@@ -65,7 +64,7 @@ def run(
     Raises:
         CalibwatchError: Rig, model or bus can not be used.
     """
-    segmenter = Segmenter(model_bytes(model))
+    segmenter = open_segmenter(model)
     rig = load_rig(rig_file)
     for pair in rig.pairs:
         if pair.lidar.topic is None or pair.camera.topic is None:

@@ -49,12 +49,12 @@ def _packaged(name: str) -> bytes:
     return packaged.read_bytes()
 
 
-def open_segmenter(path: Path | None, threads: int) -> Segmenter:
+def open_segmenter(path: Path | None, threads: int = 2) -> Segmenter:
     """A session of the network at ``path``, or of the one that ships.
 
     Args:
         path: The .onnx file, ``FREE``, or None.
-        threads: Threads that one call may use.
+        threads: Threads that one call may use; the watch counts on two cores.
 
     Raises:
         ModelError: It can not be read, or is none that this version can use; the text names the file.

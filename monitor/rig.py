@@ -52,6 +52,7 @@ _RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 """Chunks of topics that hold rectified images: image_rect, image_rect_color, image_rectified."""
 _LARGEST_FILE = 8 << 20
 """bytes; a rig file is a few kB."""
+_WANTED = "a rig file ends in .toml, or is JSON"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,15 +157,14 @@ def load_rig(path: str | Path) -> Rig:
             raise RigError(f"{path} has {path.stat().st_size} bytes, too many for a rig file")
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise RigError(
-            f"{path} can not be read: {error.strerror}", hint="--rig wants a .toml or .json file"
-        ) from error
+        raise RigError(f"{path} can not be read: {error.strerror}", hint=_WANTED) from error
     except UnicodeDecodeError as error:
-        raise RigError(f"{path} is not text", hint="--rig wants a .toml or .json file") from error
+        raise RigError(f"{path} is not text", hint=_WANTED) from error
     try:
         document = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
     except (tomllib.TOMLDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise RigError(f"{path} is not {path.suffix.lstrip('.') or 'json'}: {error}") from error
+        kind = "TOML" if path.suffix == ".toml" else "JSON"
+        raise RigError(f"{path} is not {kind}: {error}", hint=_WANTED) from error
     if not isinstance(document, dict):
         raise RigError(f"{path} holds no table", hint="a rig file has 'vehicle' and 'pairs'")
     rig = parse_rig(document, where=str(path))

@@ -1,5 +1,6 @@
 """One file per command: options -> call -> print. Every module offers ``command``."""
 
+import math
 import shutil
 import signal
 import sys
@@ -15,6 +16,32 @@ from pipeline.errors import CalibwatchError
 
 if TYPE_CHECKING:
     from pipeline.records import Floats
+
+
+class NamingGroup(click.Group):
+    """Commands below a command; one that is misspelt names the nearest."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that is named; wrong usage where there is none."""
+        known = self.list_commands(ctx)
+        if args and not args[0].startswith("-") and args[0] not in known:
+            from monitor.rig_document import nearest  # noqa: PLC0415 - pydantic is not needed for --help
+
+            ctx.fail(f"no command '{args[0]}' ({nearest(args[0], sorted(known))})")
+        return super().resolve_command(ctx, args)
+
+
+class Number(click.FloatRange):
+    """A number within a range; neither NaN, which lies within any, nor without end."""
+
+    def convert(self, value: float, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number; anything else is wrong usage."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is no number that can be worked with.", param, ctx)
+        return number
 
 
 class DriftParameter(click.ParamType["Floats"]):
@@ -159,7 +186,7 @@ def reference_sigma_option(function: Callable[..., object]) -> Callable[..., obj
     """``--reference-sigma DEG M``."""
     return click.option(
         "--reference-sigma",
-        type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.0, 1.0)),
+        type=(Number(0.0, 10.0), Number(0.0, 1.0)),
         metavar="DEG M",
         default=(0.2, 0.05),
         show_default=True,

@@ -50,6 +50,8 @@ def command(
 
     if out.exists() and not force:
         raise InputError(f"{out} exists already", hint="--force replaces it")
+    if not out.parent.is_dir():
+        raise InputError(f"{out.parent} is no folder to write {out.name} to", hint="make it, or name another")
     with commands.stop_on_signal() as stop:
         learned = learn_baselines(
             recordings, rig_file, model=model, stop=stop, progress=commands.progress_line("pairs watched:")

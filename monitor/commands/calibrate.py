@@ -40,7 +40,7 @@ MASK_PRIOR = 2.0, 0.3
 @click.option(
     "--prior-sigma",
     nargs=2,
-    type=click.FloatRange(min=0, min_open=True, max=180),
+    type=commands.Number(min=0, min_open=True, max=180),
     metavar="DEG M",
     help="The stored extrinsic may be off by so much (one sigma of each axis, degrees and metres): lines and "
     "edges are searched for the right one before it is refined. Default: it is right to 2 deg and 0.3 m.",

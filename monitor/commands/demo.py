@@ -16,7 +16,9 @@ from monitor import commands
     show_default=True,
     help="Folder for the recording, the report and the rest.",
 )
-@click.option("--seed", default=1, show_default=True, help="Of street and noise.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of street and noise."
+)
 def command(*, out: Path, seed: int) -> int:
     """Simulate a drive in which the camera mount slips, and watch it being told.
 

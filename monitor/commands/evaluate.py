@@ -18,7 +18,8 @@ LONGEST_SIDE = 1280
 
 
 @click.group(
-    epilog="Examples: calibwatch evaluate masks training/; calibwatch evaluate plk-table1 --out out/plk"
+    cls=commands.NamingGroup,
+    epilog="Examples: calibwatch evaluate masks training/; calibwatch evaluate plk-table1 --out out/plk",
 )
 def command() -> None:
     """Measure calibwatch on data whose truth is known."""
@@ -202,21 +203,21 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
 @_frame_options(starts=3)
 @click.option(
     "--rotation",
-    type=click.FloatRange(0.0, 45.0),
+    type=commands.Number(0.0, 45.0),
     default=2.0,
     show_default=True,
     help="Starts are off by up to so many degrees about each axis.",
 )
 @click.option(
     "--translation",
-    type=click.FloatRange(0.0, 5.0),
+    type=commands.Number(0.0, 5.0),
     default=0.3,
     show_default=True,
     help="Starts are off by up to so many metres along each axis.",
 )
 @click.option(
     "--prior-sigma",
-    type=(click.FloatRange(0.0, 180.0, min_open=True), click.FloatRange(0.0, 180.0, min_open=True)),
+    type=(commands.Number(0.0, 180.0, min_open=True), commands.Number(0.0, 180.0, min_open=True)),
     metavar="DEG M",
     help="Tell calibrate by how much starts may be off, as its option of this name does; default: it takes "
     "them for first guesses.",
@@ -226,7 +227,7 @@ def offsets_command(*, runs: int, seed: int, as_json: bool, out: Path | None) ->
     "--set-sigma",
     "set_sigmas",
     multiple=True,
-    type=(str, click.FloatRange(0.0, 180.0), click.FloatRange(0.0, 10.0)),
+    type=(str, commands.Number(0.0, 180.0), commands.Number(0.0, 10.0)),
     metavar="SET DEG M",
     help="The same for one set where it is known better or worse; may be given again.",
 )

@@ -43,7 +43,7 @@ _KINDS = (
 )
 @click.option(
     "--limits",
-    type=(click.FloatRange(0.0, 45.0, min_open=True), click.FloatRange(0.0, 5.0, min_open=True)),
+    type=(commands.Number(0.0, 45.0, min_open=True), commands.Number(0.0, 5.0, min_open=True)),
     metavar="DEG M",
     help="Alert limits on every axis; default: each rig's own.",
 )

@@ -14,7 +14,7 @@ from monitor import commands
 )
 @click.option(
     "--hours",
-    type=click.FloatRange(0.0, 100_000.0, min_open=True),
+    type=commands.Number(0.0, 100_000.0, min_open=True),
     default=100.0,
     show_default=True,
     help="Healthy driving, a few seconds of computing an hour.",

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from monitor import commands
+
 if TYPE_CHECKING:
     from monitor.extrinsic_file import Imported
 
@@ -22,12 +24,13 @@ class SizeParameter(click.ParamType[tuple[int, int]]):
     ) -> tuple[int, int]:
         """Width and height, px."""
         width, _, height = str(value).lower().partition("x")
-        if not (width.isdecimal() and height.isdecimal() and len(width + height) <= 10):
+        digits = width.isdecimal() and height.isdecimal() and len(width + height) <= 10
+        if not digits or int(width) * int(height) == 0:
             self.fail(f"'{value}' is no size, as in 1920x1200", param, ctx)
         return int(width), int(height)
 
 
-@click.group()
+@click.group(cls=commands.NamingGroup)
 def command() -> None:
     """Extrinsics of other formats."""
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 @click.option("--over-zenoh", is_flag=True, help="Send the recording through a real zenoh session.")
 @click.option(
     "--images-hz",
-    type=click.FloatRange(0.0, min_open=True),
+    type=commands.Number(0.0, min_open=True),
     default=2.0,
     show_default=True,
     help="Images kept in the recording per second and camera, some 0.5 MB each.",

@@ -28,7 +28,7 @@ from monitor import commands
 )
 @click.option(
     "--images-hz",
-    type=click.FloatRange(0.0, 2.0, min_open=True),
+    type=commands.Number(0.0, 2.0, min_open=True),
     default=0.2,
     show_default=True,
     help="Images kept in the recording per second and camera, some 0.5 MB each.",

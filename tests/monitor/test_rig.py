@@ -187,10 +187,10 @@ def test_store_and_matrix_together_are_refused():
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("rig.toml", "vehicle = ", "is not toml"),
-        ("rig.json", "{", "is not json"),
+        ("rig.toml", "vehicle = ", "is not TOML"),
+        ("rig.json", "{", "is not JSON"),
         ("rig.json", "[1]", "holds no table"),
-        ("rig.json", "[" * 100_000, "is not json"),
+        ("rig.json", "[" * 100_000, "is not JSON"),
     ],
 )
 def test_files_that_are_no_rig(tmp_path, name, text, words):

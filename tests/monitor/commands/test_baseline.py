@@ -76,6 +76,12 @@ def test_what_can_not_be_learned_from_is_one_line(calibwatch, cut, tmp_path):
     assert calibwatch("baseline")[0] == 2
 
 
+def test_a_file_that_can_not_be_is_told_before_any_recording_is_watched(calibwatch, tmp_path):
+    code, _, err = calibwatch("baseline", tmp_path / "absent.mcap", "--out", tmp_path / "none" / "b.json")
+    assert code == 1
+    assert "none is no folder to write b.json to" in err
+
+
 @pytest.mark.slow
 def test_a_drive_on_which_the_mount_slips_is_refused(calibwatch, drive, tmp_path):
     """It turns by a degree after two of six seconds."""

@@ -58,6 +58,34 @@ def test_an_unknown_command_names_the_nearest(calibwatch, name, told):
     assert told in err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("evaluate", "drifts"), "no command 'drifts' (did you mean 'drift'?"),
+        (("extrinsic", "show"), "no command 'show' ("),
+        (("replay", "x", "--images-hz", "nan"), "'--images-hz': nan is no number"),
+        (("replay", "x", "--images-hz", "inf"), "'--images-hz': inf is no number"),
+        (("run", "--rig", "x", "--images-hz", "nan"), "'--images-hz': nan is no number"),
+        (("calibrate", "x", "--prior-sigma", "nan", "1"), "'--prior-sigma': nan is no number"),
+        (("evaluate", "dataset", "x", "--rotation", "nan"), "'--rotation': nan is no number"),
+        (("evaluate", "drift", "x", "--limits", "0.5", "nan"), "'--limits': nan is no number"),
+        (
+            ("evaluate", "drift", "x", "--reference-sigma", "nan", "0"),
+            "--reference-sigma': nan is no",
+        ),
+        (("evaluate", "run-length", "--hours", "nan"), "'--hours': nan is no number"),
+        (("demo", "--seed", "-1"), "-1 is not in the range"),
+        (("demo", "--seed", "9" * 30), "is not in the range"),
+        (("extrinsic", "import", "x", "--out", "y.toml", "--size", "0x375"), "as in 1920x1200"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_what_can_not_be_meant_is_named_before_anything_is_read(calibwatch, arguments, told):
+    code, out, err = calibwatch(*arguments)
+    assert (code, out) == (2, "")
+    assert told in err
+
+
 def test_a_command_without_its_argument_is_wrong_usage(calibwatch):
     code, _, err = calibwatch("replay")
     assert code == 2

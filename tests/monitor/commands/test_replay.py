@@ -250,7 +250,7 @@ def test_a_bus_is_no_recording(replayed, tmp_path):
             ("carries sensor_msgs/msg/PointCloud2, not an image (an image is in: " + IMAGE_TOPIC,),
         ),
         (("camera =", "camra ="), ("rig.toml: pairs[0].camra is not a known key (did you mean 'camera'?",)),
-        (("[[pairs]]", "[[pairs"), ("rig.toml is not toml",)),
+        (("[[pairs]]", "[[pairs"), ("rig.toml is not TOML",)),
         (
             (f'info = "{INFO_TOPIC}"', "width = 640, height = 203, K = [[0,0,0],[0,0,0],[0,0,1]]"),
             ("pairs[0].camera: camera matrix K", "no positive focal length"),

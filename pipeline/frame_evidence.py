@@ -24,7 +24,7 @@ from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.segmentation import Segmenter, grid_scale
-from pipeline.sensor_seat import SensorSeat, sensor_seat
+from pipeline.sensor_seat import SensorSeat, numbered, sensor_seat
 from pipeline.spin_sense import ToldSpin
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
@@ -108,6 +108,7 @@ class Scout:
         self._segmenter = segmenter
         self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
         self._seat: SensorSeat | None = None
+        self._unnumbered = False
         self._lines_at: tuple[int, float] | None = None
         self._barren = False
         self._count = 0
@@ -145,8 +146,10 @@ class Scout:
         if self._seat is None:
             # Of the sweep as it was measured: straightening bends its rings.
             self._seat = sensor_seat(pair.cloud)
+            self._unnumbered = numbered(pair.cloud, self._seat) is not None
         with stage("motion"):
-            straight = self._ego.straighten(pair)
+            cloud = numbered(pair.cloud, self._seat) if self._unnumbered else None
+            straight = self._ego.straighten(pair if cloud is None else dataclasses.replace(pair, cloud=cloud))
         pair = dataclasses.replace(pair, cloud=straight.cloud)
         with stage("ground"):
             ground = fit_ground(pair.cloud, mount.up, rng)

@@ -167,8 +167,24 @@ def ring_numbers(cloud: PointCloud) -> NDArray[np.int64] | None:
     """A ring number for each point (-1: none), from the cloud's own field, its order or its elevations."""
     if cloud.ring is not None and has_rings(cloud):
         return cloud.ring.astype(np.int64)
-    if len(cloud) < _FEWEST_RINGS:
+    return _read_off(cloud)[0]
+
+
+def elevation_rings(cloud: PointCloud) -> NDArray[np.int64] | None:
+    """A ring number for each point where nothing but their elevations tells it, else None.
+
+    A sweep that is brought to one instant loses these: its points no longer keep their elevation.
+    """
+    if has_rings(cloud):
         return None
+    ring, by_order = _read_off(cloud)
+    return None if by_order else ring
+
+
+def _read_off(cloud: PointCloud) -> tuple[NDArray[np.int64] | None, bool]:
+    """A ring number for each point of a cloud that names none, or None; whether their order told it."""
+    if len(cloud) < _FEWEST_RINGS:
+        return None, False
     x, y, z = np.ascontiguousarray(cloud.xyz.T)
     azimuth = np.arctan2(y, x).astype(np.float64)
     across = x * x + y * y
@@ -176,11 +192,11 @@ def ring_numbers(cloud: PointCloud) -> NDArray[np.int64] | None:
     elevation = np.arctan2(z, np.sqrt(across, out=across)).astype(np.float64)
     by_order = _rings_by_order(azimuth, elevation, distance)
     if by_order is not None and _believable(by_order, elevation):
-        return by_order
+        return by_order, True
     by_elevation = _rings_by_elevation(elevation)
     if by_elevation is not None and _sharp(by_elevation, elevation):
-        return by_elevation
-    return None
+        return by_elevation, False
+    return None, False
 
 
 def _rings_by_order(

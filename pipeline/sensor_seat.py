@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.medians import group_medians, median
 from pipeline.records import Floats, PointCloud, read_only
-from pipeline.rings import ring_numbers, spin_turns
+from pipeline.rings import elevation_rings, ring_numbers, spin_turns
 from pipeline.se3 import exp_so3
 
 _ORIGIN_POINTS = 8000
@@ -95,6 +95,33 @@ def sensor_seat(cloud: PointCloud) -> SensorSeat:
     if not near or median(np.abs(after)) >= _SHARPER * median(np.abs(before)):
         return straight
     return SensorSeat(origin @ turn, R[2] @ turn)
+
+
+def numbered(cloud: PointCloud, seat: SensorSeat) -> PointCloud | None:
+    """The sweep as it was measured with the rings that only its elevations tell; None where they tell none.
+
+    Args:
+        cloud: The sweep; None comes back too where it names its rings, or their order tells them.
+        seat: How its sensor sits in it.
+    """
+    finite = np.flatnonzero(np.isfinite(cloud.xyz).all(axis=1))
+    xyz = (cloud.xyz[finite] - seat.origin) @ _to_z(seat.axis).T
+    bare = PointCloud(xyz.astype(np.float32), ring=None if cloud.ring is None else cloud.ring[finite])
+    found = elevation_rings(bare)
+    if found is None:
+        return None
+    ring = np.zeros(len(cloud), dtype=np.uint16)
+    ring[finite] = np.maximum(found, 0)
+    return dataclasses.replace(cloud, ring=ring)
+
+
+def _to_z(axis: Floats) -> Floats:
+    """Rotation (3,3) that brings a unit axis to z the shortest way."""
+    across = np.cross(axis, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(across))
+    if sine == 0.0:
+        return np.eye(3)
+    return exp_so3(across / sine * math.atan2(sine, float(axis[2])))
 
 
 def _cone_errors(p: Floats, group: NDArray[np.int64]) -> tuple[Floats, Floats]:

@@ -132,3 +132,37 @@ def test_a_recorded_sensor_is_found_alike_in_other_axes():
         found = sensor_seat.sensor_seat(told_in(cloud, T))
         assert found.origin == pytest.approx(se3.apply(T, own.origin[None])[0], abs=0.02)
         assert found.axis == pytest.approx(T[:3, :3] @ own.axis, abs=5e-4)
+
+
+UNTURNED = sensor_seat.SensorSeat(np.zeros(3), np.eye(3)[2])
+
+
+@pytest.mark.parametrize(
+    ("shift", "tilt_deg"), [((0.0, 0.0, 0.0), (0.0, 0.0)), ((0.12, -0.2, 1.1), (2.0, -1.0))]
+)
+def test_rings_that_only_elevations_tell_are_numbered_as_they_are(cloud, shift, tilt_deg):
+    R = Rotation.from_rotvec([*tilt_deg, 0.0], degrees=True).as_matrix()
+    moved = told_in(dataclasses.replace(cloud, ring=None), se3.transform(R, np.array(shift)))
+    lost = np.zeros(len(cloud), dtype=bool)
+    lost[::97] = True
+    xyz = np.where(lost[:, None], np.nan, moved.xyz).astype(np.float32)
+    seat = sensor_seat.SensorSeat(np.array(shift), R[:, 2])
+    found = sensor_seat.numbered(dataclasses.replace(moved, xyz=xyz), seat)
+    assert found.ring.dtype == np.uint16
+    np.testing.assert_array_equal(found.time, cloud.time)
+    # One number means one ring for all but near objects between the lasers.
+    given, true = found.ring[~lost].astype(int), cloud.ring[~lost].astype(int)
+    table = np.zeros((given.max() + 1, true.max() + 1), dtype=int)
+    np.add.at(table, (given, true), 1)
+    assert table.max(axis=0).sum() > 0.98 * len(given)
+    assert len(set(table.argmax(axis=0))) == true.max() + 1
+
+
+def test_rings_that_are_named_or_told_by_order_are_left_to_them(cloud):
+    assert sensor_seat.numbered(cloud, UNTURNED) is None
+    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+    order = np.lexsort((np.mod(azimuth, 2.0 * np.pi), cloud.ring))
+    assert sensor_seat.numbered(PointCloud(cloud.xyz[order]), UNTURNED) is None
+    noise = np.random.default_rng(0).normal(0.0, 5.0, (3000, 3)).astype(np.float32)
+    for xyz in (noise, noise[:2], noise[:0], np.full((50, 3), np.nan, np.float32)):
+        assert sensor_seat.numbered(PointCloud(xyz), UNTURNED) is None

@@ -122,6 +122,7 @@ def watch(
     stop: threading.Event,
     progress: Callable[[int], None] | None = None,
     ahead: Forerunner | None = None,
+    remark: str = "",
 ) -> State:
     """Drives a stream of messages through the engines until it ends or ``stop`` is set.
 
@@ -133,6 +134,7 @@ def watch(
         progress: Told the number of pairs after each one.
         ahead: Has pairs looked at before their turn. None for a source that goes on by itself: what came is
             then judged at once.
+        remark: What a reader of the files must know of this run, or empty.
 
     Returns:
         The state at the end, the first in precedence over the pairs.
@@ -152,7 +154,8 @@ def watch(
         refuse_unusable(_accounts(watching_), watching_.intake, losses)
     for engine in watching_.engines.values():
         _tell(watching_, engine.finish())
-    note = "interrupted: what came after is not judged" if interrupted else ""
+    cut = "interrupted: what came after is not judged" if interrupted else ""
+    note = "; ".join(part for part in (cut, remark) if part)
     lost = [f"output lost: {name}: {why}" for name, why in watching_.outputs.losses.items()]
     drops = drop_notes(_accounts(watching_), watching_.intake)
     told = [f"{name}: {one}" for name, engine in watching_.engines.items() for one in engine.warnings]

@@ -54,6 +54,20 @@ def _amount(name: str, number: str) -> float:
     return math.radians(value) if turns else value
 
 
+def injected_text(drift: Floats) -> str:
+    """What a reader of a verdict must know where ``drift`` (6,), rad, m, was injected."""
+    sizes = [math.degrees(value) if index < 3 else float(value) for index, value in enumerate(drift)]
+    named = [
+        f"{name} {size:+g} {'deg' if index < 3 else 'm'}"
+        for index, (name, size) in enumerate(zip(AXES, sizes, strict=True))
+        if size
+    ]
+    return (
+        f"a test by --inject: the stored extrinsic was altered so that a drift of {', '.join(named) or '0'} "
+        "is true, and the recording was judged against that"
+    )
+
+
 def inject(pair: RigPair, drift: Floats) -> RigPair:
     """The pair, its stored extrinsic altered so that the true drift is ``drift`` (6,), rad, m (DESIGN 2).
 

@@ -10,6 +10,7 @@ from monitor.bus_replay import OverBus
 from monitor.candidate_file import SUFFIX
 from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
+from monitor.injection import injected_text
 from monitor.lookahead import Forerunner
 from monitor.model_file import model_bytes
 from monitor.outputs import Outputs, Surroundings, open_outputs, write_whole
@@ -66,11 +67,12 @@ def replay(
     with closing(Forerunner(_AHEAD, prepared.frames)) as ahead:
         segmenter = Segmenter(model_bytes(model))
         outputs = _opened(out, prepared.rig.vehicle, images_hz)
+        remark = "" if drift is None else injected_text(drift)
         try:
             under_watch = watching(prepared.rig, segmenter, Parameters(), outputs, SystemClock())
             source = open_source(location)
             with OverBus(source, "replay") if over_zenoh else source as messages:
-                state = watch(under_watch, messages, messages.losses, stop, progress, ahead)
+                state = watch(under_watch, messages, messages.losses, stop, progress, ahead, remark)
         finally:
             outputs.close()
     if outputs.losses:

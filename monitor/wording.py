@@ -21,7 +21,8 @@ NEXT_STEPS: dict[State, str] = {
     "drifted": "Look at the places below. If the points under the estimated extrinsic lie on the edges of "
     "the image and those under the stored one do not, check the mount (bracket, windscreen, bolts), run "
     "`calibwatch calibrate` on a recording made after that, and put the extrinsic that it prints into the "
-    "rig file. Until then do not rely on the projection between this LiDAR and this camera.",
+    "rig file, or the one proposed here, where there is one and the mount was left as it is. Until then do "
+    "not rely on the projection between this LiDAR and this camera.",
     "suspect": "Keep driving: more evidence settles it. If it stays suspect on several drives, inspect the "
     "mount and measure the extrinsic anew: what is known better can be tested closer.",
     "unobservable": "No statement is possible from these scenes. Drive longer, where there are poles, kerbs "
@@ -128,7 +129,7 @@ def verdict_sentence(status: Status) -> str:
         suspected = _clause(status.reason)
     bodies: dict[State, str] = {
         "healthy": f"healthy since {since}: a drift beyond the limits is excluded for {watched}",
-        "drifted": f"drifted ({status.severity or 'minor'}): {moved}, {_onset_text(status)}"
+        "drifted": f"drifted ({status.severity or 'minor'}): {moved}, {onset_text(status)}"
         f"{consequence_text(status)}",
         "suspect": f"suspect since {since}: {suspected}",
         "unobservable": f"without a statement since {since}: {_clause(status.reason)}",
@@ -160,7 +161,8 @@ def consequence_text(status: Status) -> str:
     return f"; {at.range_m:.0f} m away {' and '.join(parts)}" if parts else ""
 
 
-def _onset_text(status: Status) -> str:
+def onset_text(status: Status) -> str:
+    """Since when the drift is there, as far as that is known, one clause."""
     onset = status.onset
     if onset is None:
         return f"told since {stamp_text(status.since_ns)}"

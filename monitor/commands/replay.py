@@ -95,6 +95,10 @@ def tell(summary: "Summary", out: Path, images_hz: float) -> None:
         click.echo(f"{name}: {pair.state}: {verdict_sentence(pair.last)}")
     for warning in summary.warnings:
         click.echo(f"warning: {warning}", err=True)
+    for pair in summary.pairs.values():
+        if pair.candidate is not None and pair.candidate.file is not None:
+            file = shlex.quote(str(out / pair.candidate.file))
+            click.echo(f"proposed: {file} (once accepted: calibwatch extrinsic import {file} --out RIG.toml)")
     recording = out / "recording.rrd"
     click.echo(f"report: {out / 'report.html'}")
     opens = f"{commands.viewer()} {shlex.quote(str(recording))}"

@@ -21,7 +21,7 @@ from monitor.status import (
     first_in_precedence,
     unit_of,
 )
-from monitor.wording import moved_axes, next_step, size_text, span_text, stamp_text, verdict_sentence
+from monitor.wording import moved_axes, next_step, onset_text, size_text, stamp_text, verdict_sentence
 
 _MOST_CHANGES_SHOWN = 60
 """rows of the table of states; the first and the last half of them are shown."""
@@ -34,6 +34,10 @@ _RELATIVE = {
     "stored": "relative to the stored extrinsic",
     "baseline": "relative to the rig's learned baseline",
 }
+
+
+_SEEN_LIMITS = 2.0
+"""Alert limits that the sigma of an axis may reach for it to be observable (DESIGN 4)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,8 +202,7 @@ def _onset_mark(pair: PairMaterial) -> dict[str, str] | None:
         "at": f"{at:.2f}",
         "x": f"{first:.2f}",
         "width": f"{max(last - first, 1.0):.2f}",
-        "label": f"the drift began {stamp_text(onset.stamp_ns)}, "
-        f"between {span_text(onset.from_ns, onset.to_ns)}",
+        "label": f"the drift: {onset_text(pair.last)}",
     }
 
 
@@ -334,16 +337,20 @@ def _consequence_tables(status: Status) -> list[dict[str, Any]]:
 def _witness_tables(status: Status) -> list[dict[str, Any]]:
     said = (("lines", status.witnesses.lines), ("edges", status.witnesses.edges))
     return [
-        {"title": f"Witness: {name}", "rows": _witness(witness) if witness else [("said", "nothing")]}
+        {"title": f"Witness: {name}", "rows": _witness(witness, status) if witness else [("said", "nothing")]}
         for name, witness in said
     ]
 
 
-def _witness(witness: Witness) -> list[tuple[str, str]]:
-    rows = [("frames", str(witness.frames)), ("chi2 per degree of freedom", _figure(witness.chi2, ""))]
-    for name in AXIS_NAMES:
+def _witness(witness: Witness, status: Status) -> list[tuple[str, str]]:
+    rows = [("frames", str(witness.frames))]
+    if witness.chi2 is not None:
+        rows.append(("chi2 per degree of freedom", _figure(witness.chi2, "")))
+    for name, axis in status.drift.items():
         value, sigma = getattr(witness.drift, name), getattr(witness.sigma, name)
-        told = "held" if sigma is None else f"{size_text(name, value, sign=True)} ± {size_text(name, sigma)}"
+        # As an axis is observable or not: a drift of 0.1 deg known to 50 would be read as one.
+        seen = sigma is not None and sigma <= _SEEN_LIMITS * axis.alert_limit
+        told = f"{size_text(name, value, sign=True)} ± {size_text(name, sigma)}" if seen else "not seen"
         rows.append((name, told))
     return rows
 

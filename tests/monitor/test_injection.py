@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from monitor.injection import inject, parse_inject
+from monitor.injection import inject, injected_text, parse_inject
 from monitor.rig import parse_rig
 from pipeline.errors import RigError
 from pipeline.se3 import mount_drift, transform, vehicle_axes
@@ -66,3 +66,9 @@ def test_injected_drift_is_what_the_mount_then_drifted(values, with_vehicle):
 def test_it_needs_an_extrinsic():
     with pytest.raises(RigError, match="no extrinsic to alter"):
         inject(pair_of(), np.zeros(6))
+
+
+def test_a_reader_of_the_verdict_is_told_what_was_injected():
+    told = injected_text(parse_inject("yaw=1,up=-0.05"))
+    assert "a drift of yaw +1 deg, up -0.05 m is true" in told
+    assert "a drift of 0 is true" in injected_text(np.zeros(6))

@@ -54,6 +54,8 @@ def test_an_injected_drift_is_told_with_axis_sign_and_size(replayed, cut, axis, 
     assert axis in last["reason"]
     assert f"{amount:+.2f}"[0] in last["reason"]
     assert last["severity"] == "major"
+    assert f"a drift of {axis} {amount:+g} deg is true" in summary["note"]
+    assert summary["complete"]
 
 
 def test_exit_zero_turns_the_verdicts_code_off_and_json_prints_the_summary(calibwatch, cut, tmp_path):

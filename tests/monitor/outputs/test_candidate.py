@@ -9,6 +9,7 @@ import zenoh
 
 from monitor.bus import BusSettings, listening_at, open_session
 from monitor.candidate_file import verified
+from monitor.commands.replay import tell
 from monitor.events import EndEvent, ProposalEvent, StatusEvent
 from monitor.outputs.candidate import CandidateFiles
 from monitor.outputs.candidate_bus import CandidateBus
@@ -95,7 +96,9 @@ def told(output, drive, event, state="drifted"):
 
 
 @pytest.mark.parametrize("event", [proposal(), NOTHING])
-def test_the_summary_names_the_file_or_the_reason(tmp_path, drive, event):
+def test_the_summary_names_the_file_or_the_reason_and_the_command_how_to_take_it(
+    tmp_path, drive, event, capsys
+):
     told(SummaryFile(tmp_path, "van-17"), drive, event)
     summary = Summary.model_validate_json((tmp_path / "summary.json").read_bytes())
     proposed = summary.pairs["front"].candidate
@@ -104,6 +107,9 @@ def test_the_summary_names_the_file_or_the_reason(tmp_path, drive, event):
     assert proposed.file == ("front.candidate.json" if event.document else None)
     assert summary.parts == (PARTS,)
     json.loads((tmp_path / "summary.json").read_text())
+    tell(summary, tmp_path, images_hz=2.0)
+    file = tmp_path / "front.candidate.json"
+    assert (f"calibwatch extrinsic import {file} --out" in capsys.readouterr().out) == bool(event.document)
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,40 @@ def test_words_from_outside_stay_words(tmp_path, drive):
     assert text_of(page).count('onerror="alert(1)">{{ page }}') >= 4
 
 
+def test_an_axis_that_a_witness_does_not_see_bears_no_figure(tmp_path, drive):
+    status = drive().status(60)
+    lines = status.witnesses.lines
+    blind = lines.model_copy(
+        update={
+            "chi2": None,
+            "drift": lines.drift.model_copy(update={"roll": 0.07, "pitch": 0.04}),
+            "sigma": lines.sigma.model_copy(update={"roll": 51.98, "pitch": None}),
+        }
+    )
+    status = status.model_copy(update={"witnesses": status.witnesses.model_copy(update={"lines": blind})})
+    seen = text_of(reported(tmp_path, [StatusEvent(status), EndEvent(complete=True)]))
+    said = seen.partition("Witness: lines")[2].partition("Witness: edges")[0]
+    assert "roll not seen pitch not seen yaw +0.79 deg ± 0.04 deg" in said
+    assert "51.98" not in said
+    assert "chi2" not in said
+
+
+def test_an_onset_before_the_data_is_no_interval_within_them(tmp_path, drive):
+    status = drive().status(60)
+    onset = status.onset.model_copy(update={"stamp_ns": status.onset.from_ns})
+    status = status.model_copy(update={"onset": onset})
+    page = reported(tmp_path, [StatusEvent(status), EndEvent(complete=True)])
+    assert page.count("or before, where the data begin") == 2  # in the sentence and at the mark
+    assert "the drift: since" in page
+
+
+def test_a_remark_on_a_whole_run_is_told(tmp_path, drive):
+    end = EndEvent(complete=True, note="a test by --inject")
+    page = reported(tmp_path, [StatusEvent(drive().status(5)), end])
+    assert '<p class="warning">a test by --inject</p>' in page
+    assert "did not reach the end" not in page
+
+
 def test_an_interrupted_run_says_so(tmp_path, drive):
     end = EndEvent(complete=False, note="stopped by the user", warnings=("12 messages were refused",))
     seen = text_of(reported(tmp_path, [StatusEvent(drive().status(5)), end]))

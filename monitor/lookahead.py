@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from monitor.intake import Accounts, Intake
-from monitor.lookout import Lookout
+from monitor.lookout import Lookout, measured
 from monitor.messages import Message
 from monitor.sources import Tick
 from monitor.threads import one_thread
@@ -128,7 +128,10 @@ class Forerunner:
         breaks = self._breaks.get(pair.pair)
         if breaks is None or not self._holds(pair.pair):
             return None
-        return Ahead(Foresight(found.evidence, found.scout, breaks), found.spent)
+        # Edges are found on this side: what remains on the other is still the longer part.
+        stage, spent = measured()
+        evidence = found.scout.with_edges(found.glimpse, stage)
+        return Ahead(Foresight(evidence, found.scout, breaks), (*found.spent, *spent))
 
     def settle(self, name: str) -> None:
         """The turn of a pair is over: what was found ahead of something that was forgotten is begun anew."""

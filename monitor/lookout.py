@@ -17,7 +17,7 @@ from monitor.clock import SystemClock
 from monitor.handover import give, link, receive, share
 from monitor.memory import keep_freed
 from monitor.threads import one_thread
-from pipeline.frame_evidence import FrameEvidence, Scout
+from pipeline.frame_evidence import Glimpse, Scout, Stage
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair
@@ -34,7 +34,7 @@ _PATIENCE_S = 0.0
 class Seen:
     """What was found in a pair, the scout that goes on after it, and what the stages cost: (name, ms)."""
 
-    evidence: FrameEvidence
+    glimpse: Glimpse
     scout: Scout
     spent: tuple[tuple[str, float], ...]
 
@@ -164,6 +164,12 @@ def _serve(end: socket.socket) -> None:
 def _look(scout: Scout | None, pair: FramePair) -> Seen | None:
     if scout is None:
         return None
+    stage, spent = measured()
+    return Seen(scout.glimpse(pair, stage), scout, tuple(spent))
+
+
+def measured() -> tuple[Stage, list[tuple[str, float]]]:
+    """Measures stages, and what they cost as it is known: (name, ms)."""
     spent: list[tuple[str, float]] = []
     clock = SystemClock()
 
@@ -173,7 +179,7 @@ def _look(scout: Scout | None, pair: FramePair) -> Seen | None:
         yield
         spent.append((name, (clock.monotonic_ns() - begun) / 1e6))
 
-    return Seen(scout.look(pair, stage), scout, tuple(spent))
+    return stage, spent
 
 
 def _named(equipment: Mapping[str, Equipment]) -> dict[str, object]:

@@ -73,6 +73,32 @@ class FrameEvidence:
     lines: LineFrame | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Glimpse:
+    """What one frame gave but for its edges.
+
+    Attributes:
+        dropped: Why it can not give anything, or None.
+        cloud: The sweep as it was used.
+        straight: How the sweep was brought to the exposure; None where the pair was not looked at.
+        ground: In the sweep, or None where there is none.
+        masks: Its masks, or None where it got none.
+        lines: Its lines, or None where it got none.
+    """
+
+    dropped: DropReason | None
+    cloud: PointCloud
+    straight: Straightened | None = None
+    ground: Ground | None = None
+    masks: Masks | None = None
+    lines: LineFrame | None = None
+
+
+def _shows_lines(lines: LineFrame | None) -> bool:
+    """Whether lines were looked for and found on both sides."""
+    return lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
+
+
 def edge_frame(
     pair: FramePair, edges: Edges, straight: Straightened, mount: Mount, stage: Stage
 ) -> EdgeFrame:
@@ -136,11 +162,15 @@ class Scout:
 
     def look(self, pair: FramePair, stage: Stage = unmeasured) -> FrameEvidence:
         """Edges of the frame, and lines when they are due."""
-        mount, nothing = self._mount, np.zeros((0, 3), dtype=np.float32)
+        return self.with_edges(self.glimpse(pair, stage), stage)
+
+    def glimpse(self, pair: FramePair, stage: Stage = unmeasured) -> Glimpse:
+        """Everything but the edges of the frame: the next one needs nothing of those."""
+        mount = self._mount
         if pair.image.size != (mount.camera.width, mount.camera.height):
-            return FrameEvidence("image_size", pair.cloud, nothing)
+            return Glimpse("image_size", pair.cloud)
         if len(pair.cloud) == 0:
-            return FrameEvidence("empty_cloud", pair.cloud, nothing)
+            return Glimpse("empty_cloud", pair.cloud)
         self._count += 1
         rng = np.random.default_rng([self._parameters.seed, self._count])
         if self._seat is None:
@@ -153,22 +183,27 @@ class Scout:
         pair = dataclasses.replace(pair, cloud=straight.cloud)
         with stage("ground"):
             ground = fit_ground(pair.cloud, mount.up, rng)
-        with stage("edges"):
-            seat, settings = self._seat, self._parameters.edges
-            T = mount.T_cam_lidar
-            edges = find_edges(pair.cloud, ground, mount.camera, T, settings, seat.origin, seat.axis)
         masks, lines = None, None
         if self._lines_due(pair.image_stamp_ns, straight):
             masks, lines = self._lines_of(pair, ground, rng, stage)
+            self._barren = not _shows_lines(lines)
+        return Glimpse(None, pair.cloud, straight, ground, masks, lines)
+
+    def with_edges(self, seen: Glimpse, stage: Stage = unmeasured) -> FrameEvidence:
+        """What the frame gave, with its edges; by any scout that has seen a sweep of this pair."""
+        nothing = np.zeros((0, 3), dtype=np.float32)
+        if seen.straight is None or self._seat is None:
+            return FrameEvidence(seen.dropped, seen.cloud, nothing)
+        with stage("edges"):
+            mount, seat, settings = self._mount, self._seat, self._parameters.edges
+            T = mount.T_cam_lidar
+            edges = find_edges(seen.cloud, seen.ground, mount.camera, T, settings, seat.origin, seat.axis)
         enough = edges if edges is not None and len(edges) >= _LEAST_EDGES else None
-        found_lines = lines is not None and bool(lines.cloud_lines) and bool(lines.image_lines)
-        if lines is not None:
-            self._barren = not found_lines
         dropped: DropReason | None = None
-        if enough is None and not found_lines:
+        if enough is None and not _shows_lines(seen.lines):
             dropped = "no_scan_pattern" if edges is None else "no_edges"
         points = nothing if edges is None else edges.position[edges.kind == RING_JUMP].astype(np.float32)
-        return FrameEvidence(dropped, pair.cloud, points, straight, enough, masks, lines)
+        return FrameEvidence(dropped, seen.cloud, points, seen.straight, enough, seen.masks, seen.lines)
 
     def _lines_due(self, now_ns: int, straight: Straightened) -> bool:
         """Whether the frame gets masks and lines; it is then the last that got them."""

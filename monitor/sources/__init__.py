@@ -100,11 +100,13 @@ def kinds() -> tuple[SourceKind, ...]:
 
 def open_source(location: str) -> Source:
     """The source that ``location`` is; InputError says what would be accepted."""
+    if not location:
+        raise InputError("the name of the recording is empty", hint="name a file or a folder")
     for kind in kinds():
         if kind.matches(location):
             return kind.open(location)
     if not Path(location).exists():
-        raise InputError(f"{location} does not exist")
+        raise InputError(f"{location} does not exist", hint="name a recording: a file or a folder")
     raise InputError(
         f"{location} is not a recording that is understood",
         hint="understood: .mcap, .bag, rosbag2 folder, KITTI raw drive folder, folder with calib.json",

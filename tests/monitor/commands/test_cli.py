@@ -86,6 +86,14 @@ def test_what_can_not_be_meant_is_named_before_anything_is_read(calibwatch, argu
     assert told in err
 
 
+@pytest.mark.parametrize("command", ["inspect", "replay", "calibrate"])
+def test_an_empty_name_is_not_the_present_folder(calibwatch, command, cut, monkeypatch, tmp_path):
+    (tmp_path / "drive.mcap").symlink_to(cut(5))
+    monkeypatch.chdir(tmp_path)
+    code, _, err = calibwatch(command, "")
+    assert (code, err) == (1, "calibwatch: the name of the recording is empty (name a file or a folder)\n")
+
+
 def test_a_command_without_its_argument_is_wrong_usage(calibwatch):
     code, _, err = calibwatch("replay")
     assert code == 2

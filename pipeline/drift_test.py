@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2
+from scipy.special import chdtri, chndtr
 
 from pipeline.records import AXES, Floats, read_only
 from pipeline.run_length import AlarmBudget
@@ -200,7 +200,7 @@ def _noncentrality(alarm: float) -> float:
     """Squared drift in sigmas that exceeds ``alarm`` with chance ``_NOTICED`` (F2): 51.8 at 27.86."""
 
     def excess(noncentrality: float) -> float:
-        return float(ncx2.sf(alarm, len(AXES), noncentrality)) - _NOTICED
+        return 1.0 - float(chndtr(alarm, len(AXES), noncentrality)) - _NOTICED
 
     return float(brentq(excess, 1e-6, 4.0 * alarm + 100.0, xtol=1e-3))
 
@@ -214,7 +214,7 @@ def at_chance(parameters: DriftTestParameters, budget: AlarmBudget, scene: int) 
 @functools.lru_cache(maxsize=1024)
 def _levels(budget: AlarmBudget, scene: int) -> tuple[float, float]:
     chance = budget.chance(scene)
-    return float(chi2.isf(chance, len(AXES))), float(chi2.isf(budget.suspicion_factor * chance, len(AXES)))
+    return float(chdtri(len(AXES), chance)), float(chdtri(len(AXES), budget.suspicion_factor * chance))
 
 
 def judge(

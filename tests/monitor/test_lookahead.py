@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import signal
+import subprocess
+import sys
 import threading
 from contextlib import closing
 
@@ -173,6 +175,16 @@ def test_a_process_that_is_there_at_once_looks_at_all_pairs(rig, messages, looke
     assert told_of(rig, stream, 5, expected=25) == plainly
     # The last is decided when the recording ends, and where the clock runs back one is looked at anew.
     assert len(looked_at) == {"in order": 1, "a clock that runs back": 2}[story]
+
+
+def test_the_process_loads_what_it_needs_only():
+    program = (
+        "import sys, monitor.lookout; print(*({'scipy.stats', 'rerun', 'zenoh', 'mcap'} & set(sys.modules)))"
+    )
+    ran = subprocess.run(  # noqa: S603 - our own program
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.split() == []
 
 
 def test_a_process_that_dies_is_done_without(rig, messages, looked_at, monkeypatch):

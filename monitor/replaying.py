@@ -12,7 +12,7 @@ from monitor.clock import SystemClock
 from monitor.daemon import watch, watching
 from monitor.injection import injected_text
 from monitor.lookahead import Forerunner
-from monitor.model_file import model_bytes
+from monitor.model_file import open_segmenter
 from monitor.outputs import Outputs, Surroundings, open_outputs, write_whole
 from monitor.outputs.summary import FILE_NAME, Summary
 from monitor.preparation import prepare
@@ -21,7 +21,6 @@ from monitor.status import State
 from pipeline.errors import InputError
 from pipeline.parameters import Parameters
 from pipeline.records import Floats
-from pipeline.segmentation import Segmenter
 
 OUTPUTS = ("status_log", "summary", "recording", "report", "candidate")
 """What a replay writes (DESIGN 7)."""
@@ -65,7 +64,7 @@ def replay(
     """
     prepared = prepare(location, rig_file, drift, known=lambda rig: with_baselines(rig, baseline))
     with closing(Forerunner(_AHEAD, prepared.frames)) as ahead:
-        segmenter = Segmenter(model_bytes(model))
+        segmenter = open_segmenter(model)
         outputs = _opened(out, prepared.rig.vehicle, images_hz)
         remark = "" if drift is None else injected_text(drift)
         try:

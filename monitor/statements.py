@@ -120,7 +120,7 @@ def status_of(
         drift=_drift(mount, memory, belief),
         consequence=_consequence(mount, belief),
         witnesses=_witnesses(belief),
-        drive=_drive(measured.track),
+        drive=None if memory.severity is not None else _drive(measured.track),
         window=Window(
             frames=len(stamps),
             span_s=(stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0,

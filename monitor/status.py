@@ -258,7 +258,11 @@ class Status(DocumentPart):
         default=(), description="what the drift does at several distances; none while nothing is known"
     )
     witnesses: Witnesses
-    drive: Drive | None = Field(default=None, description="null before the first scene of a drive")
+    drive: Drive | None = Field(
+        default=None,
+        description="null before the first scene of a drive, and while a drift stands: what is followed is a "
+        "mount that wanders, not one that has slipped",
+    )
     window: Window
     frames: Frames
     rates: Rates

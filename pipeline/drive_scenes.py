@@ -8,9 +8,9 @@ from pipeline import scene_sum, scene_track
 from pipeline.belief import Belief
 from pipeline.mount import Mount
 from pipeline.onset import Onset
+from pipeline.opinions import Steady
 from pipeline.parameters import Parameters
 from pipeline.scene_filter import Scene
-from pipeline.verdict import Steady
 
 _STAMPS = 1024
 """Scenes whose stamps are kept: 20 km; a drift that began before is told to have begun before the data."""

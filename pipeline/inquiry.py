@@ -11,10 +11,11 @@ from pipeline.causes import Cause, CauseParameters, Explanation, Section, explai
 from pipeline.edge_score import EdgeFrame
 from pipeline.ego import Straightened
 from pipeline.mount import Mount
+from pipeline.opinions import Doubt, Steady
 from pipeline.parameters import Parameters
 from pipeline.records import CameraModel, Floats
 from pipeline.sections import Move, Passage, Place, fresh, linearised
-from pipeline.verdict import Doubt, Memory, Steady
+from pipeline.verdict import Memory
 
 _SECTIONS = 90
 """Sections kept: two kilometres, some minutes; a cause that is older than they are stands in all of them."""

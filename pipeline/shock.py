@@ -15,7 +15,16 @@ import numpy as np
 from scipy.special import chdtri
 
 from pipeline import edge_search, edge_witness, se3
-from pipeline.edge_score import NEW_SCENE_M, UNITS, batch_of, curvatures, preference, score, score_only
+from pipeline.edge_score import (
+    NEW_SCENE_M,
+    UNITS,
+    batch_of,
+    curvatures,
+    mean_responses,
+    preference,
+    score,
+    score_only,
+)
 from pipeline.edge_search import EdgeWitnessParameters
 from pipeline.edge_witness import EdgeBatch, EdgeFrame
 from pipeline.records import AXES, CameraModel, Floats
@@ -39,6 +48,8 @@ class ShockParameters:
         most_frames: Frames on each side at most.
         least_lost: Share of its score that each side must lose under the extrinsic of the other (PROBE 5).
         least_preference: Standard errors by which the cells of each side must prefer its own.
+        least_contrast: Score of each side under its own extrinsic over chance, minus 1, and ...
+        least_peak: ... height over chance, sigma: below them a side shows nothing (``DriftTestParameters``).
         confirmations: Judgements in a row that must find it.
     """
 
@@ -51,6 +62,8 @@ class ShockParameters:
     most_frames: int = 10
     least_lost: float = 0.03
     least_preference: float = 2.0
+    least_contrast: float = 0.15
+    least_peak: float = 3.7
     confirmations: int = 2
 
 
@@ -86,6 +99,8 @@ class Shock:
             five degrees.
         lost: Share of its score that each side at least loses under the extrinsic of the other.
         preference: Standard errors by which the cells of each side at least prefer its own.
+        contrast: Score of each side at least, under its own, over chance, minus 1.
+        peak: Height of that over chance, in sigma of the scores of chance.
         before_ns: Stamp of the newest frame before it.
         since_ns: Stamp of the oldest frame after it.
     """
@@ -96,6 +111,8 @@ class Shock:
     apart: float
     lost: float
     preference: float
+    contrast: float
+    peak: float
     before_ns: int
     since_ns: int
 
@@ -138,6 +155,7 @@ def find_shock(
     camera: CameraModel,
     T_expected: Floats,
     B: Floats,
+    places: Sequence[Floats],
     settings: EdgeWitnessParameters,
     parameters: ShockParameters,
 ) -> Shock | None:
@@ -149,6 +167,7 @@ def find_shock(
         camera: Intrinsics.
         T_expected: float64 (4,4), the extrinsic that ``alertness.xi`` is against.
         B: float64 (6,6), turns xi into vehicle axes (``se3.vehicle_block``).
+        places: float64 (4,4) each, extrinsics of chance.
         settings: Of the edge witness.
         parameters: See there.
     """
@@ -175,6 +194,7 @@ def find_shock(
     statistic, apart = _with_time_free(step, covariance, feigned)
     sides = ((old, T_old, T_new), (new, T_new, T_old))
     own, other = zip(*((score_only(b, T, 0), score_only(b, T_off, 0)) for b, T, T_off in sides), strict=True)
+    contrast, peak = zip(*(_over_chance(b, T, places) for b, T, _ in sides), strict=True)
     return Shock(
         xi=step,
         covariance=covariance,
@@ -184,9 +204,24 @@ def find_shock(
             1.0 - float(b.sum() / a.sum()) if a.sum() > 0 else 0.0 for a, b in zip(own, other, strict=True)
         ),
         preference=min(preference(side[0], a, b) for side, a, b in zip(sides, own, other, strict=True)),
+        contrast=min(contrast),
+        peak=min(peak),
         before_ns=before[-1].stamp_ns,
         since_ns=since_ns,
     )
+
+
+def _over_chance(batch: EdgeBatch, T_cam_lidar: Floats, places: Sequence[Floats]) -> tuple[float, float]:
+    """Score of a side over chance, minus 1, and its height over chance in sigma.
+
+    What covers a lens has a texture too, in which some extrinsic scores more than another.
+    """
+    weights = batch.weights()
+    best, *by_chance = (weights @ mean_responses(batch, [T_cam_lidar, *places])) / weights.sum()
+    background, spread = float(np.mean(by_chance)), float(np.std(by_chance))
+    if background <= 0.0 or spread <= 0.0:
+        return 0.0, 0.0
+    return float(best) / background - 1.0, (float(best) - background) / spread
 
 
 def _with_time_free(step: Floats, covariance: Floats, feigned: Floats) -> tuple[float, float]:
@@ -231,7 +266,8 @@ def weighed(
 def believed(shock: Shock, budget: AlarmBudget, parameters: ShockParameters) -> bool:
     """Whether a step is no chance: at the rate that a year of driving allows, and both sides say so."""
     clear = shock.lost > parameters.least_lost and shock.preference > parameters.least_preference
-    return clear and shock.statistic > _level(budget)
+    seen = shock.contrast >= parameters.least_contrast and shock.peak >= parameters.least_peak
+    return clear and seen and shock.statistic > _level(budget)
 
 
 def moved(shock: Shock, budget: AlarmBudget) -> bool:

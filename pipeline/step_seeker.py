@@ -9,9 +9,9 @@ from pipeline.belief import Belief
 from pipeline.edge_score import EdgeFrame, batch_of, mean_responses
 from pipeline.mount import Mount
 from pipeline.onset import Onset
+from pipeline.opinions import Steady
 from pipeline.parameters import Parameters
 from pipeline.shock import Alertness, find_shock, heeded, moved, weighed
-from pipeline.verdict import Steady
 
 
 class StepSeeker:
@@ -51,8 +51,8 @@ class StepSeeker:
         """What the newest frames say of a sudden move, once judgements enough in a row found it."""
         if belief.edges is None:
             return None
-        T_expected, B = belief.edges.trail.T_stored, se3.vehicle_block(self._mount.R_vehicle_cam)
-        args = self._mount.camera, T_expected, B, self._settings, self._parameters
+        trail, B = belief.edges.trail, se3.vehicle_block(self._mount.R_vehicle_cam)
+        args = self._mount.camera, trail.T_stored, B, trail.places, self._settings, self._parameters
         found = find_shock(frames, self._alertness, *args)
         self._alertness = weighed(self._alertness, found, self._budget, self._parameters)
         if found is None or self._alertness.found < self._parameters.confirmations:

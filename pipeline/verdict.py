@@ -9,6 +9,7 @@ import numpy as np
 from pipeline import reasons
 from pipeline.drift_test import Judgement
 from pipeline.onset import Onset
+from pipeline.opinions import Doubt, Steady
 from pipeline.records import AXES, Floats
 
 State: TypeAlias = Literal["starting", "healthy", "suspect", "drifted", "unobservable", "stale", "fault"]
@@ -52,45 +53,6 @@ class VerdictParameters:
     agreement_sigma: float = 2.0
     patience_ns: int = 10_000_000_000
     silence_ns: int = 2_000_000_000
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Steady:
-    """What is said of a drift beside the window as a whole.
-
-    All scenes of a drive speak of a small steady one (``scene_sum``), the newest frames of a sudden one
-    (``shock``).
-
-    Attributes:
-        alarming: They say 'moved', at the run length that is wanted.
-        suspicious: They want more evidence.
-        drift: float64 (6,), rad and m, since then.
-        sigma: float64 (6,), of it, the floor between scenes included.
-        over: What it was heard over: ``12 scenes``, ``the last 0.6 s``.
-        onset: When it began.
-        timed: A jump of the time between sweeps and images would look the same.
-    """
-
-    alarming: bool
-    suspicious: bool
-    drift: Floats
-    sigma: Floats
-    over: str
-    onset: Onset
-    timed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """Why evidence is not held against the mount: clock or lens explain it as well, or better (``inquiry``).
-
-    Attributes:
-        code: Out of ``CODES``.
-        reason: One sentence.
-    """
-
-    code: str
-    reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +136,14 @@ def silent(memory: Memory, now_ns: int, parameters: VerdictParameters) -> Memory
         return memory
     seconds = parameters.silence_ns / 1e9
     return _enter(memory, "no_input", f"No pair of sweep and image for {seconds:.0f} s.", now_ns)
+
+
+def unheard(memory: Memory, code: str, reason: str, now_ns: int, parameters: VerdictParameters) -> Memory:
+    """A pair gave no evidence, for the reason given: what was known lasts no longer than patience does."""
+    patient = now_ns - memory.monitored_ns < parameters.patience_ns
+    if patient or memory.state not in ("starting", "healthy"):
+        return memory
+    return _enter(memory, code, reason, now_ns)
 
 
 def faulted(memory: Memory, reason: str, now_ns: int) -> Memory:
@@ -313,16 +283,29 @@ def acknowledge(memory: Memory, now_ns: int, by: str, why: str) -> Memory:
     return _enter(opened, "collecting", reason, now_ns)
 
 
-def finish(memory: Memory, judgement: Judgement | None, frames: int, required: tuple[str, ...]) -> Memory:
-    """The state at the end of a recording: one still starting says why it can say nothing (DESIGN 4)."""
+def finish(
+    memory: Memory,
+    judgement: Judgement | None,
+    frames: int,
+    required: tuple[str, ...],
+    unheard: tuple[str, str],
+) -> Memory:
+    """The state at the end of a recording: one still starting says why it can say nothing (DESIGN 4).
+
+    Args:
+        memory: Before it.
+        judgement: The last one, or None.
+        frames: Pairs that were looked at.
+        required: Axes that must be monitored for 'healthy'.
+        unheard: Code and reason where pairs gave nothing to judge.
+    """
     if memory.state != "starting":
         return memory
     now_ns = memory.input_ns
     if frames == 0:
         return _enter(memory, "no_pairs", "No pair of sweep and image could be used.", now_ns)
     if judgement is None:
-        reason = "The clouds show no rings, so no edges could be compared with the image."
-        return _enter(memory, "no_scan_pattern", reason, now_ns)
+        return _enter(memory, *unheard, now_ns)
     few = f"{frames} frame{'s are' if frames != 1 else ' is'} too few for a verdict"
     if judgement.blind:
         return _enter(memory, *reasons.blindness(judgement), now_ns)

@@ -25,6 +25,20 @@ from pipeline.segmentation import Segmenter
 from pipeline.spin_sense import ToldSpin
 from pipeline.step_seeker import StepSeeker
 
+_UNHEARD: dict[DropReason, tuple[str, str]] = {
+    "image_size": ("no_pairs", "Images are not of the size that the intrinsics are for."),
+    "empty_cloud": ("no_scan_pattern", "The clouds are empty."),
+    "no_scan_pattern": (
+        "no_scan_pattern",
+        "The clouds show no rings, so no edges could be compared with the image.",
+    ),
+    "no_edges": (
+        "nothing_in_common",
+        "The cloud shows no edges within the image: open country, or a sensor that looks elsewhere.",
+    ),
+}
+"""Code and reason of frames that give no evidence for long."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
@@ -92,6 +106,7 @@ class Watch:
         self._seeker = StepSeeker(mount, parameters)
         self._begun_ns = 0
         self._judged_ns: int | None = None
+        self._unheard = _UNHEARD["no_scan_pattern"]
         self.departed: Counter[window.Departure] = Counter()
 
     @property
@@ -143,6 +158,9 @@ class Watch:
         self._enter(now_ns)
         findings = self._looked_at(pair, stage, foresight)
         if findings.dropped is not None:
+            self._unheard = _UNHEARD[findings.dropped]
+            assert self.memory is not None  # noqa: S101 - set on entry
+            self.memory = verdict.unheard(self.memory, *self._unheard, now_ns, self.parameters.verdict)
             return findings
         self.frames += 1
         return self._judged(findings, now_ns, stage)
@@ -171,7 +189,8 @@ class Watch:
         if self.belief is not None:
             judgement = self.belief.judgement
             self.memory = self._dating.redated(self.memory, self.mount, self._expectation(), self.belief)
-        self.memory = verdict.finish(self.memory, judgement, self._scout.count, self.mount.required)
+        required = self.mount.required
+        self.memory = verdict.finish(self.memory, judgement, self._scout.count, required, self._unheard)
         self._propose(now_ns, ended=True)
 
     def acknowledge(self, now_ns: int, by: str, why: str) -> bool:

@@ -32,7 +32,7 @@ MOUNT = Mount(
 )
 
 
-def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None, track=None):
+def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None, track=None, memory=None):
     rates = Rates(lidar_hz=None, camera_hz=None, gap_ms=None)
     measured = Measured(
         received=7,
@@ -47,7 +47,8 @@ def said(belief=None, window_ns=(), lines_ns=(), mount=MOUNT, explanation=None, 
         track=track,
     )
     identity = Identity("van-1", "front", NONE, NONE, "calibwatch test")
-    return status_of(identity, mount, verdict.start(5), belief, measured, 3, 9)
+    memory = verdict.start(5) if memory is None else memory
+    return status_of(identity, mount, memory, belief, measured, 3, 9)
 
 
 def judged():
@@ -157,3 +158,6 @@ def test_where_the_mount_is_by_all_scenes_is_told_from_the_first_on():
     assert 0.0 < told.drift.yaw < 0.2
     assert -0.03 < told.drift.up < 0.0
     assert told.sigma.yaw == pytest.approx(math.degrees(math.sqrt(track.drift_covariance[2, 2])))
+    # A step is not followed: beside the size that is told it would name another.
+    slipped = dataclasses.replace(verdict.start(5), state="drifted", severity="major")
+    assert said(track=track, memory=slipped).drive is None

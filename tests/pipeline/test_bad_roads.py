@@ -157,20 +157,12 @@ def after(what, seconds):
     return _driven(scene(1), 1, which, look, motion)[1]
 
 
-UNJUDGED = pytest.mark.xfail(
-    reason="frames without edges are not judged, so that what was told before them stands", strict=True
-)
-SHAKEN = pytest.mark.xfail(
-    reason="the texture of what covers a lens is taken for a step of the mount", strict=True
-)
-
-
 @pytest.mark.parametrize(
     ("what", "seconds"),
     [
-        pytest.param("open country", PATIENCE_S + 1, marks=UNJUDGED),
+        ("open country", PATIENCE_S + 1),
         pytest.param("tunnel", PATIENCE_S + WINDOW_S, marks=pytest.mark.slow),
-        pytest.param("covered", PATIENCE_S + WINDOW_S, marks=[pytest.mark.slow, SHAKEN]),
+        pytest.param("covered", PATIENCE_S + WINDOW_S, marks=pytest.mark.slow),
     ],
 )
 def test_who_was_healthy_is_so_no_longer_than_patience_once_nothing_is_seen(what, seconds):

@@ -8,6 +8,7 @@ from scipy import stats
 from pipeline import se3, shock
 from pipeline.belief import believe
 from pipeline.edge_search import EdgeWitnessParameters
+from pipeline.edge_witness import far_extrinsics
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair
@@ -50,11 +51,32 @@ def moved(frames, mount, step, first):
     return [*frames[:first], *(seen(frame) for frame in frames[first:])]
 
 
+def chance_of(mount):
+    """Extrinsics of chance."""
+    return tuple(far_extrinsics(mount.T_cam_lidar, EdgeWitnessParameters(), np.random.default_rng(0)))
+
+
 def found(frames, mount, step, first=5):
     alertness = Alertness((), frames[first].stamp_ns, 5, ZERO)
     B = se3.vehicle_block(mount.R_vehicle_cam)
-    args = mount.camera, mount.T_cam_lidar, B, EdgeWitnessParameters(), P
+    args = mount.camera, mount.T_cam_lidar, B, chance_of(mount), EdgeWitnessParameters(), P
     return find_shock(moved(frames, mount, step, first), alertness, *args)
+
+
+def sure_step():
+    """A step that is believed."""
+    return shock.Shock(
+        xi=ZERO,
+        covariance=np.eye(6),
+        statistic=46.0,
+        apart=46.0,
+        lost=0.1,
+        preference=4.0,
+        contrast=0.5,
+        peak=8.0,
+        before_ns=0,
+        since_ns=1,
+    )
 
 
 def test_no_step_is_found_where_there_is_none(second):
@@ -127,11 +149,22 @@ def test_a_side_with_too_few_frames_or_with_other_objects_says_nothing(second):
 
 
 @pytest.mark.parametrize(
-    "change", [{"statistic": 45.0}, {"lost": 0.02}, {"preference": 1.9}], ids=["chance", "score", "cells"]
+    "change",
+    [{"statistic": 45.0}, {"lost": 0.02}, {"preference": 1.9}, {"contrast": 0.14}, {"peak": 3.6}],
+    ids=["chance", "score", "cells", "contrast", "peak"],
 )
 def test_each_doubt_alone_is_enough_not_to_believe_it(change):
     sure = shock.Shock(
-        ZERO, np.eye(6), statistic=46.0, apart=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1
+        ZERO,
+        np.eye(6),
+        statistic=46.0,
+        apart=46.0,
+        lost=0.1,
+        preference=4.0,
+        contrast=0.5,
+        peak=8.0,
+        before_ns=0,
+        since_ns=1,
     )
     assert stats.chi2.sf(46.0, 6) * BUDGET.yearly_scenes < BUDGET.yearly_alarms
     assert believed(sure, BUDGET, P)
@@ -141,7 +174,16 @@ def test_each_doubt_alone_is_enough_not_to_believe_it(change):
 def test_a_step_is_sought_until_it_is_far_from_any_belief():
     opened = Alertness((), 1, 5, ZERO)
     sure = shock.Shock(
-        ZERO, np.eye(6), statistic=46.0, apart=46.0, lost=0.1, preference=4.0, before_ns=0, since_ns=1
+        ZERO,
+        np.eye(6),
+        statistic=46.0,
+        apart=46.0,
+        lost=0.1,
+        preference=4.0,
+        contrast=0.5,
+        peak=8.0,
+        before_ns=0,
+        since_ns=1,
     )
     assert weighed(opened, None, BUDGET, P) is opened
     once = weighed(opened, sure, BUDGET, P)
@@ -175,7 +217,16 @@ def test_a_step_just_after_what_was_taken_for_one_is_sought_too():
     opened = heard([*CALM, 0.27, 0.27, 0.27, 0.30, 0.31])
     assert opened.since_ns == len(CALM) * TENTH
     far = shock.Shock(
-        ZERO, np.eye(6), statistic=3.0, apart=3.0, lost=0.0, preference=0.0, before_ns=0, since_ns=1
+        ZERO,
+        np.eye(6),
+        statistic=3.0,
+        apart=3.0,
+        lost=0.0,
+        preference=0.0,
+        contrast=0.5,
+        peak=8.0,
+        before_ns=0,
+        since_ns=1,
     )
     let_go = weighed(opened, far, BUDGET, P)
     assert let_go.since_ns is None

@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 from pipeline import verdict
 from pipeline.drift_test import Judgement
 from pipeline.onset import Onset
+from pipeline.opinions import Steady
 from pipeline.records import AXES
-from pipeline.verdict import CODES, State, Steady, VerdictParameters, acknowledge, advance, start
+from pipeline.verdict import CODES, State, VerdictParameters, acknowledge, advance, start
 
 S = 1_000_000_000
 P = VerdictParameters()
 LIMITS = np.array([math.radians(0.75), math.radians(0.5), math.radians(0.5), 0.20, 0.15, 0.15])
+UNHEARD = ("no_scan_pattern", "The clouds show no rings.")
 REQUIRED = ("pitch", "yaw")
 
 
@@ -178,7 +180,7 @@ def drifted():
 
 
 def test_every_code_can_be_told():
-    no_pairs = verdict.finish(start(0), None, 0, REQUIRED)
+    no_pairs = verdict.finish(start(0), None, 0, REQUIRED, UNHEARD)
     memories = [
         walked(),
         walked(QUIET),
@@ -186,11 +188,11 @@ def test_every_code_can_be_told():
         walked(DOUBTFUL),
         walked(CONTRADICTED),
         drifted(),
-        verdict.finish(walked(UNMONITORED), UNMONITORED, 4, REQUIRED),
+        verdict.finish(walked(UNMONITORED), UNMONITORED, 4, REQUIRED, UNHEARD),
         walked(*[UNMONITORED] * 10),
         walked(*[BLIND] * 10),
         walked(*[AMBIGUOUS] * 10),
-        verdict.finish(start(0), None, 4, REQUIRED),
+        verdict.finish(start(0), None, 4, REQUIRED, UNHEARD),
         no_pairs,
         verdict.silent(walked(QUIET), 4 * S, P),
         verdict.faulted(walked(QUIET), "the disk is full", 4 * S),
@@ -341,7 +343,7 @@ def test_a_drift_outlives_a_fault():
     ],
 )
 def test_a_recording_that_ends_in_starting_says_why(judged, frames, code):
-    memory = verdict.finish(start(7), judged, frames, REQUIRED)
+    memory = verdict.finish(start(7), judged, frames, REQUIRED, UNHEARD)
     assert told(memory) == ("unobservable", code)
     if code == "too_short":
         assert f"{frames} frame" in memory.reason
@@ -351,7 +353,7 @@ def test_a_recording_that_ends_in_starting_says_why(judged, frames, code):
 @pytest.mark.parametrize("judgements", [(QUIET,), (SUSPICIOUS,), (ALARM,) * 3, (BLIND,) * 10])
 def test_a_reached_verdict_stands_at_the_end(judgements):
     memory = walked(*judgements)
-    assert verdict.finish(memory, judgements[-1], 20, REQUIRED) is memory
+    assert verdict.finish(memory, judgements[-1], 20, REQUIRED, UNHEARD) is memory
 
 
 def test_only_required_axes_are_asked_and_only_excluded_ones_named():

@@ -61,7 +61,7 @@ _YAW_RATE = 0.05
 
 
 def _typical_covariance() -> Floats:
-    sigma = np.array([math.radians(0.12), math.radians(0.10), math.radians(0.07), 0.025, 0.023, 0.025])
+    sigma = np.array([math.radians(0.08), math.radians(0.07), math.radians(0.045), 0.015, 0.014, 0.016])
     correlation = np.eye(6)
     correlation[1, 5] = correlation[5, 1] = 0.78
     correlation[2, 4] = correlation[4, 2] = -0.9
@@ -70,7 +70,7 @@ def _typical_covariance() -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvidenceModel:
-    """How the estimates of scenes scatter; but for ``street``, defaults are those of ten image-level streets.
+    """How the estimates of scenes scatter; but for ``street``, defaults are those of 16 image-level streets.
 
     Attributes:
         covariance: float64 (6,6), stated for a scene of middling worth, vehicle axes, rad and m.
@@ -88,11 +88,11 @@ class EvidenceModel:
 
     covariance: Floats = field(default_factory=_typical_covariance)
     worth_spread: float = 0.5
-    ratio: float = 0.8
-    common: float = 0.25
+    ratio: float = 1.1
+    common: float = 0.2
     common_m: float = 100.0
     freedom: float = 5.0
-    ridden: float = 0.3
+    ridden: float = 0.375
     ridden_ratio: float = 3.6
     street: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     correlation_m: float = 150.0

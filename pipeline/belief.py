@@ -1,5 +1,6 @@
 """What a window of frames says about the mount: both witnesses solved, fused, and tested."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -98,8 +99,12 @@ def believe(
         contradicted=contradicted,
         feigned=feigned,
     )
+    judgement = drift_test.judge(evidence, expectation, mount.limits, test)
+    if edges is not None:
+        doubted = judgement.suspicious or judgement.alarming or judgement.blind
+        edges = dataclasses.replace(edges, trail=dataclasses.replace(edges.trail, doubted=doubted))
     return Belief(
-        judgement=drift_test.judge(evidence, expectation, mount.limits, test),
+        judgement=judgement,
         evidence=evidence,
         T_estimated=read_only(T_estimated),
         edges=edges,

@@ -100,13 +100,13 @@ class Maxima:
         nearest: float64 (6,), the one that the climb from the stored extrinsic reaches, camera axes.
         rivals: Others that were preferred to it when they were found.
         searched_ns: Stamps of the window's frames when others were last sought.
-        widely: Whether they were sought from further away then.
+        reach: Steps of the grid of turns, to each side, from which they were sought since then; 0: from none.
     """
 
     nearest: Floats
     rivals: tuple[Rival, ...]
     searched_ns: tuple[int, ...]
-    widely: bool
+    reach: int
 
 
 Top: TypeAlias = tuple[Floats, float]
@@ -129,6 +129,8 @@ def find_maxima(
     parameters: EdgeWitnessParameters,
     known: Maxima | None,
     curvature: Floats | None,
+    *,
+    far: bool,
 ) -> tuple[Maxima, Top]:
     """The maxima of a window, and the one to believe: the nearest, unless another scores clearly more.
 
@@ -139,26 +141,28 @@ def find_maxima(
         parameters: See there.
         known: Maxima of the window before, or None.
         curvature: float64 (6,6), alert units, of the score at the maximum of before, or None.
+        far: Whether the true one may lie far off.
     """
     if known is None or _renewed(batch.stamps_ns, known.searched_ns):
         nearest = ascend(batch, T_stored, np.zeros(6), 0, parameters, stored)
         rivals = _followed(batch, T_stored, known, parameters, curvature) if known is not None else []
         rivals += [(top, parameters.least_gain) for top in _by_coarser(batch, T_stored, nearest, parameters)]
-        searched, widely = batch.stamps_ns, False
+        searched, reach = batch.stamps_ns, 0
     else:
         nearest = ascend(batch, T_stored, known.nearest, 0, parameters, curvature=curvature)
         rivals = _followed(batch, T_stored, known, parameters, curvature)
-        searched, widely = known.searched_ns, known.widely
+        searched, reach = known.searched_ns, known.reach
     base = nearest if _near(nearest[0], parameters) and nearest[1] > stored[0] else (np.zeros(6), stored[0])
     lost = base[1] > stored[0] * (1.0 + parameters.lost_gain)
     best, kept = _preferred(batch, T_stored, base, rivals, parameters, lost=lost)
-    if not widely and best[1] > stored[0] * (1.0 + parameters.stirring_gain):
-        further = _from_further_away(batch, T_stored, best[0], parameters, lost=lost)
+    wanted = _FAR_TICKS if far else _TICKS
+    if reach < wanted and best[1] > stored[0] * (1.0 + parameters.stirring_gain):
+        further = _from_further_away(batch, T_stored, best[0], parameters, wanted, lost=lost)
         best, kept = _preferred(
             batch, T_stored, base, [*rivals, (further, parameters.wide_gain)], parameters, lost=lost
         )
-        widely = True
-    return Maxima(nearest[0], kept, searched, widely), best
+        reach = wanted
+    return Maxima(nearest[0], kept, searched, reach), best
 
 
 def _renewed(stamps_ns: Sequence[int], searched_ns: Sequence[int]) -> bool:
@@ -228,7 +232,13 @@ def _near(xi: Floats, parameters: EdgeWitnessParameters) -> bool:
 
 
 def _from_further_away(
-    batch: EdgeBatch, T_stored: Floats, xi: Floats, parameters: EdgeWitnessParameters, *, lost: bool
+    batch: EdgeBatch,
+    T_stored: Floats,
+    xi: Floats,
+    parameters: EdgeWitnessParameters,
+    ticks: int,
+    *,
+    lost: bool,
 ) -> Top:
     """The highest maximum reached from turns about all axes and from shifts ahead, or from ``xi``.
 
@@ -237,7 +247,7 @@ def _from_further_away(
     thin = batch.thinned(max(1, len(batch) // _SEARCHED))
     top = (xi, score(thin, se3.retract(T_stored, xi), 0)[0])
     known = [xi]
-    for begin in _promising(thin, T_stored, parameters):
+    for begin in _promising(thin, T_stored, parameters, ticks):
         top = _climbed(thin, T_stored, begin, known, top, parameters)
     if lost:
         for step in np.concatenate([np.diag(UNITS), -np.diag(UNITS)]) * _HOP:
@@ -266,15 +276,17 @@ _HOP = 3.0
 """Alert units: beyond what the blur of level 1 bridges (0.75 deg, 15 cm)."""
 
 
-def _promising(thin: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParameters) -> list[Floats]:
+def _promising(
+    thin: EdgeBatch, T_stored: Floats, parameters: EdgeWitnessParameters, ticks: int
+) -> list[Floats]:
     """Where climbs from further away begin: the best of a grid of turns, and shifts ahead and back.
 
     A shift aside looks like a turn at any one range, so turns lead to both (PROBE 3); only a shift along the
     optical axis looks like none.
     """
-    ticks = np.arange(-_TICKS, _TICKS + 1) * parameters.wide_rad
-    turns = np.stack(np.meshgrid(ticks, ticks, ticks[_TICKS % 2 :: 2], indexing="ij"), axis=-1).reshape(-1, 3)
-    turns = turns[np.linalg.norm(turns, axis=1) <= (_TICKS + 0.5) * parameters.wide_rad]
+    steps = np.arange(-ticks, ticks + 1) * parameters.wide_rad
+    turns = np.stack(np.meshgrid(steps, steps, steps[ticks % 2 :: 2], indexing="ij"), axis=-1).reshape(-1, 3)
+    turns = turns[np.linalg.norm(turns, axis=1) <= (ticks + 0.5) * parameters.wide_rad]
     places = np.hstack([turns, np.zeros_like(turns)])
     level = len(thin.images) - 1
     heights = _heights(
@@ -305,9 +317,12 @@ _AT_ONCE = 64
 _SEARCHED = 1200
 """Edges that a search from further away looks at; all of them decide."""
 
-_TICKS = 8
-"""Steps of the grid to each side, 6 deg: where the truth lies outside every maximum is false, and some look
-like a small drift. Every other step of roll, which is seen less sharply."""
+_TICKS = 3
+"""Steps of the grid to each side; every other one of roll, which is seen less sharply."""
+
+_FAR_TICKS = 8
+"""The same where the truth may lie far off, 6 deg: where it is outside the grid every maximum is false, and some
+look like a small drift."""
 
 _PROMISING = 5
 """Best places of the grid that are climbed from."""

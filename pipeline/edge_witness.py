@@ -81,6 +81,7 @@ class Trail:
         inside: float64 (6,), the best xi inside the floor.
         shares: What each frame adds, by its stamp.
         places: float64 (4,4) each, the extrinsics of chance.
+        doubted: Whether what was found is doubtful: the truth may then lie far off.
     """
 
     T_stored: Floats
@@ -88,6 +89,7 @@ class Trail:
     inside: Floats
     shares: Mapping[int, FrameShare]
     places: tuple[Floats, ...]
+    doubted: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +153,13 @@ def solve(
     known = None if trail is None else _curvature(batch, trail.shares)
     stored = score(batch, T_stored, 0)
     maxima, (xi, best) = find_maxima(
-        batch, T_stored, stored, parameters, None if trail is None else trail.maxima, known
+        batch,
+        T_stored,
+        stored,
+        parameters,
+        None if trail is None else trail.maxima,
+        known,
+        far=trail is None or trail.doubted,
     )
     T_best = se3.retract(T_stored, xi)
     shares = _shares(batch, T_stored, xi, places, {} if trail is None else trail.shares, parameters)

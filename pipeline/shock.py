@@ -186,7 +186,7 @@ def find_shock(
     old, new = (batch_of(side, camera, settings.most_edges) for side in (before, after))
     xi, _ = edge_search.ascend(old, T_expected, alertness.xi, 0, settings)
     T_old = se3.retract(T_expected, xi)
-    _, (step, _) = edge_search.find_maxima(new, T_old, score(new, T_old, 0), settings, None, None)
+    _, (step, _) = edge_search.find_maxima(new, T_old, score(new, T_old, 0), settings, None, None, far=False)
     T_new = se3.retract(T_old, step)
     covariance = _mean_covariance(old, T_old, settings) + _mean_covariance(new, T_new, settings)
     feigned = B.T @ np.mean([frame.feigned for frame in after], axis=0)

@@ -321,7 +321,7 @@ _TICKS = 3
 """Steps of the grid to each side; every other one of roll, which is seen less sharply."""
 
 _FAR_TICKS = 8
-"""The same where the truth may lie far off, 6 deg: of maxima that are all false, some look like a small drift."""
+"""The same where the truth may lie far off, 6 deg: other maxima are false, some look like a small drift."""
 
 _PROMISING = 5
 """Best places of the grid that are climbed from."""

@@ -282,21 +282,15 @@ def _row_medians(values: Floats) -> Floats:
 
 
 def _peak(signed: Floats, window: NDArray[np.bool_], offset: Floats, floor: Floats) -> Floats:
-    """Offset (M,) of each cross-section's strongest slope in its window, by a parabola; NaN for none.
-
-    The parabola is the best one through five samples, a px to either side: halfway between px the slope reads
-    steeper (one step of grey) than on them (the mean of two), and through three samples the top leans to the
-    steeper reading, along an upright stroke always the same way: by up to 0.3 px.
-    """
+    """Offset (M,) of each cross-section's strongest slope in its window, by a parabola; NaN for none."""
     inside = np.where(window, signed, -np.inf)
     best = inside.argmax(axis=1)
     rows = np.arange(len(signed))
-    safe = np.clip(best, 2, signed.shape[1] - 3)
-    a, b, at, c, d = (signed[rows, safe + k] for k in (-2, -1, 0, 1, 2))
-    is_peak = (best == safe) & (at > floor) & (at >= b) & (at >= c)
-    rise = (2.0 * (d - a) + c - b) / 10.0
-    bend = np.minimum((2.0 * (a + d - at) - b - c) / 7.0, -1e-9)
-    shift = np.clip(-rise / bend, -1.0, 1.0)
+    safe = np.clip(best, 1, signed.shape[1] - 2)
+    before, at, after = (signed[rows, safe + k] for k in (-1, 0, 1))
+    is_peak = (best == safe) & (at > floor) & (at >= before) & (at >= after)
+    bend = np.minimum(before - 2 * at + after, -1e-9)
+    shift = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
     return np.where(is_peak, offset[safe] + shift * SAMPLE_PX, np.nan)
 
 

@@ -175,6 +175,14 @@ def test_an_alarm_needs_every_sign_of_a_drift(changes, alarming, suspicious):
 
 
 @pytest.mark.parametrize(
+    ("turn_deg", "peak", "alarming"), [(2.4, 5.9, True), (2.6, 5.9, False), (2.6, 6.1, True)]
+)
+def test_a_turn_so_wide_that_many_places_were_searched_needs_a_higher_peak(turn_deg, peak, alarming):
+    judgement = judged(unit(2, math.radians(turn_deg)), peak=peak)
+    assert (judgement.alarming, judgement.blind) == (alarming, not alarming)
+
+
+@pytest.mark.parametrize(
     ("changes", "suspicious"),
     [({"loss": 0.0}, False), ({"loss": 0.099}, False), ({"loss": 0.101}, True)],
 )

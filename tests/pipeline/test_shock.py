@@ -154,18 +154,7 @@ def test_a_side_with_too_few_frames_or_with_other_objects_says_nothing(second):
     ids=["chance", "score", "cells", "contrast", "peak"],
 )
 def test_each_doubt_alone_is_enough_not_to_believe_it(change):
-    sure = shock.Shock(
-        ZERO,
-        np.eye(6),
-        statistic=46.0,
-        apart=46.0,
-        lost=0.1,
-        preference=4.0,
-        contrast=0.5,
-        peak=8.0,
-        before_ns=0,
-        since_ns=1,
-    )
+    sure = sure_step()
     assert stats.chi2.sf(46.0, 6) * BUDGET.yearly_scenes < BUDGET.yearly_alarms
     assert believed(sure, BUDGET, P)
     assert not believed(dataclasses.replace(sure, **change), BUDGET, P)
@@ -173,18 +162,7 @@ def test_each_doubt_alone_is_enough_not_to_believe_it(change):
 
 def test_a_step_is_sought_until_it_is_far_from_any_belief():
     opened = Alertness((), 1, 5, ZERO)
-    sure = shock.Shock(
-        ZERO,
-        np.eye(6),
-        statistic=46.0,
-        apart=46.0,
-        lost=0.1,
-        preference=4.0,
-        contrast=0.5,
-        peak=8.0,
-        before_ns=0,
-        since_ns=1,
-    )
+    sure = sure_step()
     assert weighed(opened, None, BUDGET, P) is opened
     once = weighed(opened, sure, BUDGET, P)
     assert (once.found, once.since_ns) == (1, 1)
@@ -216,18 +194,7 @@ def test_responses_that_fall_together_open_the_search_at_the_first_of_them():
 def test_a_step_just_after_what_was_taken_for_one_is_sought_too():
     opened = heard([*CALM, 0.27, 0.27, 0.27, 0.30, 0.31])
     assert opened.since_ns == len(CALM) * TENTH
-    far = shock.Shock(
-        ZERO,
-        np.eye(6),
-        statistic=3.0,
-        apart=3.0,
-        lost=0.0,
-        preference=0.0,
-        contrast=0.5,
-        peak=8.0,
-        before_ns=0,
-        since_ns=1,
-    )
+    far = dataclasses.replace(sure_step(), statistic=3.0, apart=3.0, lost=0.0, preference=0.0)
     let_go = weighed(opened, far, BUDGET, P)
     assert let_go.since_ns is None
     assert heard([0.22, 0.23, 0.22], let_go, begin=13).since_ns == 13 * TENTH

@@ -17,7 +17,8 @@ from monitor.messages import Message
 from monitor.preparation import prepare
 from monitor.sources import open_source
 from pipeline import cameras, se3
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edge_parameters import EdgeParameters
+from pipeline.edges import find_edges
 from pipeline.ground import fit_ground
 from pipeline.mount import Mount
 from pipeline.records import Floats, FramePair

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import edge_witness, se3
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import EdgeBatch, EdgeFrame, EdgeWitnessParameters
-from pipeline.edges import CELLS, EdgeParameters, find_edges
+from pipeline.edges import CELLS, find_edges
 from pipeline.gradients import GradientPyramid
 from pipeline.ground import Ground
 from pipeline.records import CameraModel, Floats, PointCloud

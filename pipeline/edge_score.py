@@ -57,7 +57,7 @@ class EdgeBatch:
         weight: float64 (N,).
         cell: int64 (N,), which part of the image on which stretch of road.
         slot: int64 (N,), frame that an edge belongs to, ascending.
-        kind: uint8 (N,), what it is the edge of (``edges.KIND_NAMES``).
+        kind: uint8 (N,), what it is the edge of (``edge_parameters.KIND_NAMES``).
         images: For each level of the pyramid those of the frames, uint16 (4,h,w).
         scales: For each level, see ``gradients.GradientPyramid``.
         camera: Intrinsics.

@@ -13,8 +13,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pipeline import edge_witness, line_witness, window
+from pipeline.edge_parameters import RING_JUMP
 from pipeline.edge_witness import EdgeFrame
-from pipeline.edges import RING_JUMP, Edges, find_edges
+from pipeline.edges import Edges, find_edges
 from pipeline.ego import Ego, Straightened
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import Ground, fit_ground

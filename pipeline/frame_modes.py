@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from pipeline import edge_witness, se3
+from pipeline.edge_parameters import KIND_NAMES
 from pipeline.edge_witness import UNITS, EdgeBatch, EdgeWitnessParameters
-from pipeline.edges import CELL_COLUMNS, CELLS, KIND_NAMES
+from pipeline.edges import CELL_COLUMNS, CELLS
 from pipeline.records import Floats
 
 Top: TypeAlias = tuple[Floats, float]

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from pipeline.causes import CauseParameters
 from pipeline.drift_test import DriftTestParameters
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import EdgeWitnessParameters
-from pipeline.edges import EdgeParameters
 from pipeline.masks import MaskParameters
 from pipeline.scene_sum import SceneSumParameters
 from pipeline.scene_track import TrackParameters

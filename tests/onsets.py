@@ -16,8 +16,9 @@ import numpy as np
 from monitor.daemon import mount_of
 from monitor.preparation import prepare
 from pipeline import se3
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import EdgeFrame
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edges import find_edges
 from pipeline.ego import Ego
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground

@@ -9,7 +9,8 @@ import pytest
 
 from pipeline.cameras import project
 from pipeline.cloud_lines import unrepeated
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edge_parameters import EdgeParameters
+from pipeline.edges import find_edges
 from pipeline.ground import fit_ground
 from pipeline.image_lines import MOST_PIECES, find_image_lines
 from pipeline.image_segments import find_image_segments

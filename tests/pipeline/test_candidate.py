@@ -19,8 +19,9 @@ from pipeline.candidate import (
     combined,
     moved_since,
 )
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import NEW_SCENE_M, EdgeFrame
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edges import find_edges
 from pipeline.ego import Ego
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground

@@ -12,8 +12,9 @@ from pipeline import se3, verdict
 from pipeline.belief import Belief
 from pipeline.dating import Dating
 from pipeline.drift_test import DriftTestParameters, Evidence, Judgement, expectation_of_stored
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import EdgeFrame
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edges import find_edges
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground
 from pipeline.mount import Mount

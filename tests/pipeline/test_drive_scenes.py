@@ -7,10 +7,11 @@ import pytest
 from pipeline.belief import Belief
 from pipeline.drift_test import Evidence, expectation_of_stored, judge
 from pipeline.drive_scenes import DriveScenes
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_score import batch_of
 from pipeline.edge_search import EdgeWitnessParameters
 from pipeline.edge_witness import EdgeFrame, solve
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edges import find_edges
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground
 from pipeline.mount import Mount

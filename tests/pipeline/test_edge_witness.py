@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipeline import cameras, edge_score, edge_witness, se3
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import UNITS, EdgeFrame, EdgeWitnessParameters, batch_of, score, score_only, solve
-from pipeline.edges import CELLS, EdgeParameters, Edges, find_edges
+from pipeline.edges import CELLS, Edges, find_edges
 from pipeline.gradients import COUNTS, LEVELS, ORIENTATIONS, GradientPyramid, gradient_pyramid, sample
 from pipeline.ground import fit_ground
 from pipeline.records import CameraImage, CameraModel, PointCloud

@@ -8,17 +8,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipeline import cameras, edges, se3
-from pipeline.edges import (
-    BETWEEN_RINGS,
-    CELL_COLUMNS,
-    CELL_ROWS,
-    CELLS,
-    KIND_NAMES,
-    PAINT,
-    RING_JUMP,
-    EdgeParameters,
-    find_edges,
-)
+from pipeline.edge_parameters import BETWEEN_RINGS, KIND_NAMES, PAINT, RING_JUMP, EdgeParameters
+from pipeline.edges import CELL_COLUMNS, CELL_ROWS, CELLS, find_edges
+from pipeline.field_of_view import in_view
 from pipeline.ground import Ground
 from pipeline.records import CameraModel, PointCloud
 
@@ -335,7 +327,7 @@ def test_nothing_of_the_view_is_lost_to_the_field_of_view(street, model, D):
     camera = CameraModel(
         model, np.array([[400.0, 0, 480], [0, 400, 200], [0, 0, 1]]), np.array(D, float), 960, 400
     )
-    mask = edges._in_view(street.cloud, camera, street.T_cam_lidar)  # noqa: SLF001
+    mask = in_view(street.cloud, camera, street.T_cam_lidar)
     _, inside = cameras.project(camera, se3.apply(street.T_cam_lidar, street.cloud.xyz))
     assert not (inside & ~mask).any()
     assert mask.sum() < 0.75 * len(street.cloud)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from pipeline import edge_witness, se3
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_witness import UNITS, EdgeFrame, batch_of
-from pipeline.edges import CELLS, EdgeParameters, find_edges
+from pipeline.edges import CELLS, find_edges
 from pipeline.frame_modes import ModeParameters, Prior, evened, find_tops, joined_by, shrunk_moments, weighed
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground

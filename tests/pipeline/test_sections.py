@@ -7,9 +7,10 @@ import pytest
 from pipeline import edge_score, se3
 from pipeline.causes import CLOCK, LENS, CauseParameters, explain
 from pipeline.deskew import Twist
+from pipeline.edge_parameters import EdgeParameters
 from pipeline.edge_score import EdgeFrame
 from pipeline.edge_witness import EdgeWitnessParameters
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edges import find_edges
 from pipeline.gradients import gradient_pyramid
 from pipeline.ground import fit_ground
 from pipeline.mount import Mount

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline import se3, sensor_seat
-from pipeline.edges import EdgeParameters, find_edges
+from pipeline.edge_parameters import EdgeParameters
+from pipeline.edges import find_edges
 from pipeline.ground import fit_ground
 from pipeline.records import PointCloud
 from pipeline.sensor_seat import sensor_origin

@@ -27,8 +27,8 @@ class EdgeParameters:
             lies open, and half of this gap is three times the blur of the image.
         above_ground_m: The nearer point of a jump to the ring above stands at least so high, m.
         gap_steps: A gap along the ring of more azimuth steps breaks it: what lies there was not seen.
-        view_lasting: Without rings so many neighbours in a row lie farther: one or two may be seen past the
-            border by a sensor that stands elsewhere.
+        view_lasting: Without rings so many neighbours in a row lie farther: where a sensor beside the camera
+            looks past a border, near and far points alternate, and three far ones follow by chance.
         view_above_ground_m: Without rings an edge stands so high above the ground, m: neighbours along a row
             of the view lie at different places of a road that recedes.
         inset: How far an edge lies from the nearer point towards the farther ray, in steps: between the two,
@@ -54,7 +54,7 @@ class EdgeParameters:
     sparsest_rad: float = math.radians(0.8)
     above_ground_m: float = 0.4
     gap_steps: float = 2.6
-    view_lasting: int = 3
+    view_lasting: int = 5
     view_above_ground_m: float = 0.2
     inset: float = 0.45
     weights: tuple[float, float, float] = (1.0, 0.5, 1.0)

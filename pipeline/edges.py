@@ -17,7 +17,7 @@ from pipeline.edge_parameters import KIND_NAMES, EdgeParameters
 from pipeline.field_of_view import in_view
 from pipeline.ground import Ground
 from pipeline.records import CameraModel, Floats, PointCloud, read_only
-from pipeline.ring_edges import ring_edges
+from pipeline.ring_edges import ring_edges, rings_are_mixed
 from pipeline.rings import scan_pattern, spin_turns
 from pipeline.view_edges import view_edges
 
@@ -72,8 +72,8 @@ def find_edges(
 ) -> Edges | None:
     """Edges of the cloud that fall into the image or just beside it; None where neighbours can not be told.
 
-    Neighbours are those along and between the rings of a spinning sensor, or where there are no rings those
-    along the rows and columns of the camera's view.
+    Neighbours are those along and between the rings of a spinning sensor. Where there are none, or those of
+    several sensors under the same numbers, they are those along rows and columns of the camera's view.
 
     Args:
         cloud: The sweep.
@@ -105,7 +105,7 @@ def _along_rings(
         T_lidar_spin = T_lidar_sensor @ se3.transform(turn.T, np.zeros(3))
         own, plane = _seen_in(*at_sensor, se3.transform(turn.T, np.zeros(3)))
         pattern = scan_pattern(own, in_view(own, camera, T_cam_lidar @ T_lidar_spin))
-        if pattern is not None:
+        if pattern is not None and not rings_are_mixed(pattern, parameters):
             R, t = T_lidar_spin[:3, :3], T_lidar_spin[:3, 3]
             found = ring_edges(own, pattern, plane, parameters)
             return [(position @ R.T + t, direction @ R.T) for position, direction in found]

@@ -36,7 +36,8 @@ DropReason: TypeAlias = Literal["image_size", "empty_cloud", "no_scan_pattern", 
 
 image_size: the image is not of the size that the intrinsics are for.
 empty_cloud: the sweep holds no point.
-no_scan_pattern: the cloud shows no rings, and the frame had no lines either.
+no_scan_pattern: the cloud shows neither rings nor enough points and ground in view to do without, and the
+    frame had no lines either.
 no_edges: no edge of the cloud falls into the image.
 """
 

@@ -13,7 +13,7 @@ from pipeline.field_of_view import in_view
 from pipeline.ground import Ground
 from pipeline.paint_edges import paint_borders
 from pipeline.records import CameraModel, Floats, PointCloud
-from pipeline.view_rows import ViewRows, lasting_jumps, point_spacing, view_angles, view_rows
+from pipeline.view_rows import ViewRows, joined, lasting_jumps, point_spacing, view_angles, view_rows
 
 
 def view_edges(
@@ -43,8 +43,6 @@ def view_edges(
         return None
     rows = view_rows(right, upwards, distance, spacing)
     columns = view_rows(upwards, right, distance, spacing)
-    if rows is None or columns is None:
-        return None
     standing = ground.heights(xyz) > parameters.view_above_ground_m
     aside = np.column_stack([np.cos(right), np.zeros_like(right), -np.sin(right)]) @ R
     up = (
@@ -64,12 +62,13 @@ def view_edges(
         found.append((np.zeros((0, 3)), np.zeros((0, 3))))
     if cloud.intensity is not None:
         order = rows.index
-        joined = (np.diff(rows.row) == 0) & (np.diff(rows.along) < parameters.gap_steps * rows.step)
         # Only what leads aside counts: points of a row lie at the nearer and the farther side of it by turns.
         way = np.diff(rows.along) * reach[order][:-1]
         intensity = cloud.intensity[seen][order].astype(np.float64)
-        place = (xyz[order], aside[order], intensity, rows.distance)
-        found.append(paint_borders(*place, joined, way, ground, parameters))
+        linked = joined(rows, parameters.gap_steps * spacing)
+        found.append(
+            paint_borders(xyz[order], aside[order], intensity, rows.distance, linked, way, ground, parameters)
+        )
     return found
 
 
@@ -83,7 +82,8 @@ def _jumps(
     parameters: EdgeParameters,
 ) -> tuple[Floats, Floats]:
     """Points beside which others lie farther, moved towards those; ``tangents``: unit (N,3), m/rad (N,)."""
-    place, way = lasting_jumps(rows, least[rows.index], parameters.view_lasting, parameters.gap_steps)
+    widest = parameters.gap_steps * rows.width
+    place, way = lasting_jumps(rows, least[rows.index], parameters.view_lasting, widest)
     point = rows.index[place]
     kept = standing[point]
     point, way = point[kept], way[kept]

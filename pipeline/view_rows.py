@@ -30,14 +30,14 @@ class ViewRows:
         row: int64 (M,), its row.
         along: float64 (M,), its place along the row, rad, growing.
         distance: float64 (M,), range from the camera, m.
-        step: Median angle between neighbours of a row, rad.
+        width: Of the rows, rad: with so many points as there are, neighbours of a row are as far apart.
     """
 
     index: NDArray[np.int64]
     row: NDArray[np.int64]
     along: Floats
     distance: Floats
-    step: float
+    width: float
 
 
 def view_angles(xyz_cam: Floats) -> tuple[Floats, Floats, Floats]:
@@ -65,26 +65,28 @@ def point_spacing(right: Floats, upwards: Floats) -> float | None:
     return _PATCH_RAD / math.sqrt(usual) if usual >= _FEWEST_IN_PATCH else None
 
 
-def view_rows(along: Floats, across: Floats, distance: Floats, width: float) -> ViewRows | None:
-    """Orders points by rows of ``width`` rad; None where no two of them share a row.
+def view_rows(along: Floats, across: Floats, distance: Floats, width: float) -> ViewRows:
+    """Orders points by rows.
 
     Args:
         along: float64 (N,), angle along the rows, rad.
         across: float64 (N,), angle across them, rad.
         distance: float64 (N,), m.
-        width: rad.
+        width: Of a row, rad.
     """
     row = np.floor(across / width).astype(np.int64)
     order = np.lexsort((along, row))
     row, along = row[order], along[order]
-    steps = np.diff(along)[np.diff(row) == 0]
-    if steps.size == 0:
-        return None
-    return ViewRows(order, row, along, distance[order], median(steps))
+    return ViewRows(order, row, along, distance[order], width)
+
+
+def joined(rows: ViewRows, widest: float) -> NDArray[np.bool_]:
+    """Whether each ordered point and the next (M-1,) share a row without a gap of ``widest`` rad."""
+    return np.asarray((np.diff(rows.row) == 0) & (np.diff(rows.along) < widest))
 
 
 def lasting_jumps(
-    rows: ViewRows, least: Floats, lasting: int, gap_steps: float
+    rows: ViewRows, least: Floats, lasting: int, widest: float
 ) -> tuple[NDArray[np.int64], Floats]:
     """Points of a row beside which the next ones lie farther: place in the order (K,), and the way (K,).
 
@@ -95,11 +97,10 @@ def lasting_jumps(
         least: float64 (M,), m, by how much the others lie farther, for each ordered point.
         lasting: So many in a row do: where near and far points alternate, a sensor looks past the border from
             another place than the camera.
-        gap_steps: A wider gap, in steps of the row, was not seen.
+        widest: A wider gap was not seen, rad.
     """
     places, ways = [], []
-    gaps = np.diff(rows.along)
-    joined = (np.diff(rows.row) == 0) & (gaps < gap_steps * rows.step)
+    linked = joined(rows, widest)
     count = len(rows.row)
     for sense in (1, -1):
         near = np.arange(count)
@@ -109,7 +110,7 @@ def lasting_jumps(
             link = np.minimum(other, other - sense)
             there = (link >= 0) & (link < count - 1)
             found &= there
-            found[there] &= joined[link[there]]
+            found[there] &= linked[link[there]]
             found[there] &= (rows.distance[other[there]] - rows.distance[near[there]]) > least[near[there]]
         chosen = np.flatnonzero(found)
         places.append(chosen)

@@ -30,7 +30,7 @@ _UNHEARD: dict[DropReason, tuple[str, str]] = {
     "empty_cloud": ("no_scan_pattern", "The clouds are empty."),
     "no_scan_pattern": (
         "no_scan_pattern",
-        "The clouds show no rings, so no edges could be compared with the image.",
+        "The clouds show neither rings nor enough points and ground in view to find edges without them.",
     ),
     "no_edges": (
         "nothing_in_common",

@@ -28,7 +28,8 @@ class Rig:
         camera: Intrinsics.
         turn: Rotation vector of the LiDAR's axes in the vehicle, rad.
         numbered: Whether the cloud names its rings.
-        merged: Two LiDARs in one cloud in the vehicle's frame, at one instant, without rings and times.
+        merged: Two LiDARs in one cloud in the vehicle's frame, at one instant, without times.
+        mixed: Both with the same ring numbers; else without any.
     """
 
     rings: int = 64
@@ -36,6 +37,7 @@ class Rig:
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     numbered: bool = True
     merged: bool = False
+    mixed: bool = False
 
 
 RIGS = {
@@ -43,6 +45,7 @@ RIGS = {
     "128 rings": Rig(rings=128),
     "rings unnumbered": Rig(numbered=False),
     "merged": Rig(rings=32, merged=True),
+    "merged, rings mixed": Rig(rings=32, merged=True, mixed=True),
     "barrel": Rig(camera=camera("plumb_bob", (-0.28, 0.1, 0.001, -0.001, -0.015), 280.0)),
     "fisheye": Rig(camera=camera("equidistant", (0.02, -0.005, 0.001, 0.0), 240.0, (540, 300))),
     "turned": Rig(turn=(math.pi / 2, 0.0, 0.0)),
@@ -62,7 +65,7 @@ def drive_of(rig, seed, frames, columns=900):
     drive = Drive(parameters)
     if rig.merged:
         T_cam_vehicle = parameters.T_stored @ se3.inverse(parameters.T_vehicle_lidar)
-        return [_merged(drive, index) for index in range(frames)], T_cam_vehicle, np.eye(4)
+        return [_merged(drive, index, mixed=rig.mixed) for index in range(frames)], T_cam_vehicle, np.eye(4)
     turn = se3.transform(se3.exp_so3(np.array(rig.turn)), np.zeros(3))
     pairs = []
     for frame in drive:
@@ -78,7 +81,7 @@ def _pair(frame, cloud, stamp_ns):
     return FramePair("front", cloud, frame.image, stamp_ns, frame.image_stamp_ns, 0.1)
 
 
-def _merged(drive, index):
+def _merged(drive, index, *, mixed):
     """One of two LiDARs at the sides of the roof, as it all stood at the exposure."""
     frame, p = drive.frame(index), drive.parameters
     start = (frame.cloud_stamp_ns - START_NS) / 1e9
@@ -91,6 +94,6 @@ def _merged(drive, index):
         moments, which = np.unique(cloud.time, return_inverse=True)
         T = back @ drive.T_world_vehicle(start + moments.astype(np.float64)) @ seat
         xyz = np.einsum("nij,nj->ni", T[which, :3, :3], cloud.xyz) + T[which, :3, 3]
-        parts.append((xyz.astype(np.float32), cloud.intensity))
-    xyz, intensity = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return _pair(frame, PointCloud(xyz, intensity), frame.image_stamp_ns)
+        parts.append((xyz.astype(np.float32), cloud.intensity, cloud.ring))
+    xyz, intensity, ring = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return _pair(frame, PointCloud(xyz, intensity, ring if mixed else None), frame.image_stamp_ns)

@@ -11,8 +11,12 @@ from pipeline import cameras, edges, se3
 from pipeline.edge_parameters import BETWEEN_RINGS, KIND_NAMES, PAINT, RING_JUMP, EdgeParameters
 from pipeline.edges import CELL_COLUMNS, CELL_ROWS, CELLS, find_edges
 from pipeline.field_of_view import in_view
-from pipeline.ground import Ground
+from pipeline.ground import Ground, fit_ground
 from pipeline.records import CameraModel, PointCloud
+from pipeline.ring_edges import rings_are_mixed
+from pipeline.rings import scan_pattern
+from pipeline.simulation.drive import START_NS
+from pipeline.simulation.lidar import sweep
 
 P = EdgeParameters()
 STEP, GAP = math.radians(0.2), math.radians(0.5)
@@ -331,6 +335,25 @@ def test_nothing_of_the_view_is_lost_to_the_field_of_view(street, model, D):
     _, inside = cameras.project(camera, se3.apply(street.T_cam_lidar, street.cloud.xyz))
     assert not (inside & ~mask).any()
     assert mask.sum() < 0.75 * len(street.cloud)
+
+
+def test_rings_of_two_sensors_under_the_same_numbers_are_not_gone_along(drive, street):
+    shift = se3.transform(np.eye(3), np.array([0.0, -1.2, 0.1]))
+    start = (street.cloud_stamp_ns - START_NS) / 1e9
+    lidar = drive.parameters.lidar
+    beside = sweep(
+        drive.scene, lidar, lambda t: drive.T_world_lidar(t) @ shift, start, np.random.default_rng(7)
+    )
+    cloud = street.cloud
+    xyz = np.concatenate([cloud.xyz, beside.xyz + shift[:3, 3].astype(np.float32)])
+    two = PointCloud(xyz, ring=np.concatenate([cloud.ring, beside.ring]))
+    for seen, mixed in ((cloud, False), (beside, False), (two, True)):
+        assert rings_are_mixed(scan_pattern(seen, np.ones(len(seen), dtype=bool)), P) == mixed
+    plane = fit_ground(cloud, np.array([0.0, 0.0, 1.0]), np.random.default_rng(0))
+    T, camera = street.T_cam_lidar, drive.parameters.camera
+    named, unnamed = (find_edges(c, plane, camera, T, P) for c in (two, PointCloud(xyz)))
+    np.testing.assert_array_equal(named.position, unnamed.position)
+    assert len(named) > 300
 
 
 def test_no_rings_no_answer_and_no_view_no_answer(street):

@@ -230,7 +230,7 @@ def road_ahead(pair):
     [
         ("image_size", lambda p: dataclasses.replace(p, image=CameraImage(np.zeros((90, 270, 3), np.uint8)))),
         ("empty_cloud", lambda p: without(p, np.zeros(len(p.cloud), bool))),
-        ("no_scan_pattern", lambda p: without(p, p.cloud.ring == 40)),
+        ("no_edges", lambda p: without(p, p.cloud.ring == 40)),
         ("no_scan_pattern", lambda p: without(p, p.cloud.xyz[:, 0] < -1)),
         ("no_scan_pattern", lambda p: without(p, np.arange(len(p.cloud)) < 3)),
         ("no_edges", road_ahead),

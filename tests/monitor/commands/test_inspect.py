@@ -164,12 +164,13 @@ def test_rings_are_found_where_no_field_tells_them(path):
     assert found.pairs[0].gap_ms == pytest.approx(-40.0)
 
 
-def test_a_cloud_without_rings_is_a_problem(path):
+def test_a_cloud_without_rings_is_told_and_no_problem(path):
     rng = np.random.default_rng(3)
     cloud = PointCloud(rng.normal(size=(3000, 3)).astype(np.float32) * 10)
     found = inspect(recorded(path, cloud=cloud), None)
     assert topic(found, "/lidar").cloud.rings is None
-    assert any("no rings" in problem for problem in found.pairs[0].problems)
+    assert not any("ring" in problem for problem in found.pairs[0].problems)
+    assert any("no rings found" in line for line in _lines(found))
 
 
 def test_clocks_apart_are_told_with_their_distance(path):

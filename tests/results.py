@@ -1,7 +1,8 @@
 """The figures in docs/results.md: ``python -m tests.results FOLDER`` with a folder of recordings (DESIGN 11).
 
-Every sequence is judged with its own extrinsic and with ones that are wrong by a known amount; every single
-frame is calibrated. Markdown goes to stdout. The engine is the one of ``replay``, without its outputs.
+Every sequence is judged with its own extrinsic and with ones that are wrong by a known amount, once as it is
+and once without its rings; every single frame is calibrated. Markdown goes to stdout. The engine is the one
+of ``replay``, without its outputs.
 """
 
 import dataclasses
@@ -22,7 +23,8 @@ from monitor.preparation import prepare
 from monitor.rig import RigPair
 from monitor.sources import open_source
 from pipeline.parameters import Parameters
-from pipeline.records import AXES, FramePair
+from pipeline.records import AXES, FramePair, PointCloud
+from pipeline.rings import ring_numbers
 from pipeline.segmentation import Segmenter
 from pipeline.watch import Watch
 
@@ -36,20 +38,23 @@ SEQUENCES = (
 WRONG = tuple((axis, sign * 1.0) for axis in AXES[:3] for sign in (1, -1)) + tuple(
     (axis, 0.3) for axis in AXES[3:]
 )
+CUBE_M = 0.1
+"""m; clouds of several sensors are often thinned so before they are passed on."""
 
 
 def main() -> None:
     """Prints all tables."""
     folder = Path(sys.argv[1])
-    what = sys.argv[2:] or ["sequences", "singles"]
+    what = sys.argv[2:] or ["sequences", "ringless", "singles"]
     segmenter = Segmenter(model_bytes(None))
-    if "sequences" in what:
-        print(
-            "| recording | injected | state | told after | roll pitch yaw (deg) | forward left up (m) | T |"
-        )
-        print("|---|---|---|---|---|---|---|")
-        for name in SEQUENCES:
-            _sequence(folder / name, segmenter)
+    for part, rings in (("sequences", True), ("ringless", False)):
+        if part in what:
+            print(
+                "\n| recording | injected | state | told after | roll pitch yaw (deg) | forward left up (m) | T |"
+            )
+            print("|---|---|---|---|---|---|---|")
+            for name in SEQUENCES:
+                _sequence(folder / name, segmenter, rings=rings)
     if "singles" in what:
         print("\n| frame | error roll pitch yaw (deg) | forward left up (m) | observable | why not |")
         print("|---|---|---|---|---|")
@@ -68,9 +73,27 @@ def _pairs(location: str, pair: RigPair) -> list[FramePair]:
     return pairs + intake.flush()
 
 
-def _sequence(path: Path, segmenter: Segmenter) -> None:
+def _without_rings(cloud: PointCloud, rng: np.random.Generator) -> PointCloud:
+    """The means of all points in each cube of ``CUBE_M``, in no order: neither rings nor times are left."""
+    cube = np.floor(cloud.xyz / CUBE_M).astype(np.int64)
+    _, which, counts = np.unique(cube, axis=0, return_inverse=True, return_counts=True)
+
+    def means(values: np.ndarray) -> np.ndarray:
+        return np.bincount(which.ravel(), values) / counts
+
+    order = rng.permutation(len(counts))
+    xyz = np.column_stack([means(column) for column in cloud.xyz.T])[order]
+    intensity = None if cloud.intensity is None else means(cloud.intensity)[order].astype(np.float32)
+    return PointCloud(xyz.astype(np.float32), intensity)
+
+
+def _sequence(path: Path, segmenter: Segmenter, *, rings: bool) -> None:
     rig = prepare(str(path), None, None).rig
     pairs = _pairs(str(path), rig.pairs[0])
+    if not rings:
+        rng = np.random.default_rng(1)
+        pairs = [dataclasses.replace(pair, cloud=_without_rings(pair.cloud, rng)) for pair in pairs]
+        assert ring_numbers(pairs[0].cloud) is None
     for axis, amount in (("none", 0.0), *WRONG):
         drift = np.zeros(6)
         if axis != "none":

@@ -38,6 +38,9 @@ SEQUENCES = (
 WRONG = tuple((axis, sign * 1.0) for axis in AXES[:3] for sign in (1, -1)) + tuple(
     (axis, 0.3) for axis in AXES[3:]
 )
+HEAD = """| recording | injected | state | told after | roll pitch yaw (deg) | forward left up (m) | T |
+|---|---|---|---|---|---|---|"""
+
 CUBE_M = 0.1
 """m; clouds of several sensors are often thinned so before they are passed on."""
 
@@ -49,10 +52,7 @@ def main() -> None:
     segmenter = Segmenter(model_bytes(None))
     for part, rings in (("sequences", True), ("ringless", False)):
         if part in what:
-            print(
-                "\n| recording | injected | state | told after | roll pitch yaw (deg) | forward left up (m) | T |"
-            )
-            print("|---|---|---|---|---|---|---|")
+            print("\n" + HEAD)
             for name in SEQUENCES:
                 _sequence(folder / name, segmenter, rings=rings)
     if "singles" in what:

@@ -125,6 +125,8 @@ class Fitted(_Values):
     streets: int
     ridden: int
     ridden_ratio: float
+    within: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """Share of all errors within one stated sigma and within two."""
     scenes: int
     ratio: tuple[float, float, float]
     share: tuple[float, float, float]
@@ -200,6 +202,7 @@ def fitted_to(streets: list[list[Scene]]) -> Fitted:
         streets=found.streets,
         ridden=found.ridden,
         ridden_ratio=found.ridden_ratio,
+        within=found.within,
         scenes=found.scenes,
         ratio=found.ratio,
         share=found.share,

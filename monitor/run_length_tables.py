@@ -26,6 +26,9 @@ def _fitted_lines(found: Fitted) -> list[str]:
         "| quantity | fitted | 90 % interval |",
         "|---|---|---|",
     ]
+    for sigmas, (middle, low, high) in enumerate(found.within, 1):
+        name = f"errors within {sigmas} stated sigma, all streets"
+        lines.append(f"| {name} | {middle:.0%} | {low:.0%} to {high:.0%} |")
     for name, (middle, low, high) in (
         ("random error over the stated one (ratio)", found.ratio),
         ("difference of streets over the floor (share)", found.share),

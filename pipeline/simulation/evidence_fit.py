@@ -28,6 +28,9 @@ _RIDDEN = 4.0
 """Mean square error in stated sigmas beyond which the scenes of a street lie in false modes: the mean of
 honest ones is one."""
 
+_REACH = 1.645
+"""Standard errors to each side that hold 90 %."""
+
 _FREEDOMS = np.array([3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 60.0, 200.0])
 """Degrees of freedom that are tried for the tails."""
 
@@ -40,6 +43,8 @@ class EvidenceFit:
         streets: How many drives.
         ridden: How many of them lie in false modes; ratio, share, correlation and tails are of the others.
         ridden_ratio: Sigmas of the random error over the stated ones in those; 0 where there are none.
+        within: Share of the errors of all streets, axis by axis, within one stated sigma and within two, each
+            with its 90 % interval.
         scenes: Scenes of the others.
         ratio: Sigmas of the random error over the stated ones, and its 90 % interval.
         share: Sigmas of the systematic part, the same in all scenes of a street, over those of the floor, and
@@ -59,6 +64,7 @@ class EvidenceFit:
     streets: int
     ridden: int
     ridden_ratio: float
+    within: tuple[tuple[float, float, float], tuple[float, float, float]]
     scenes: int
     ratio: tuple[float, float, float]
     share: tuple[float, float, float]
@@ -117,6 +123,7 @@ def fit(drives: Sequence[Sequence[Scene]], floor: Floats) -> EvidenceFit:
         streets=len(drives),
         ridden=len(ridden),
         ridden_ratio=math.sqrt(np.mean([block.mean_square() for block in ridden])) if ridden else 0.0,
+        within=(_within(every, 1.0), _within(every, 2.0)),
         scenes=len(squares),
         ratio=ratio,
         share=share,
@@ -166,9 +173,28 @@ class _Block:
         """Of the errors in stated sigmas, over scenes and axes."""
         return float(np.mean(self.whitened() ** 2))
 
+    def inside(self, sigmas: float) -> int:
+        """How many errors lie within so many stated sigmas, over scenes and axes."""
+        stated = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        return int(np.count_nonzero(np.abs(self.drifts) < sigmas * stated))
+
     def whitened(self) -> Floats:
         """Errors in stated sigmas, (n,6)."""
         return np.asarray(np.linalg.solve(self.roots, self.drifts[..., None])[..., 0])
+
+
+def _within(blocks: Sequence[_Block], sigmas: float) -> tuple[float, float, float]:
+    """Share of errors within so many stated sigmas, and its 90 % interval by leaving out street by street.
+
+    Scenes of one street see the same things: streets are what is independent.
+    """
+    inside = np.array([block.inside(sigmas) for block in blocks], dtype=np.float64)
+    size = np.array([block.drifts.size for block in blocks], dtype=np.float64)
+    share = float(inside.sum() / size.sum())
+    without = (inside.sum() - inside) / (size.sum() - size)
+    streets = len(blocks)
+    reach = _REACH * math.sqrt((streets - 1) / streets * float(np.sum((without - without.mean()) ** 2)))
+    return share, max(0.0, share - reach), min(1.0, share + reach)
 
 
 def _interval(

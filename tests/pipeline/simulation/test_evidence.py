@@ -9,7 +9,7 @@ from pipeline.drift_test import DriftTestParameters
 from pipeline.errors import InputError
 from pipeline.scene_filter import Scene
 from pipeline.simulation.evidence import EvidenceModel, Road, scenes
-from pipeline.simulation.evidence_fit import fit
+from pipeline.simulation.evidence_fit import _Block, _within, fit
 
 FLOOR = DriftTestParameters().floor()
 ROAD = (Road("town", 10.0, 0.0, 1e9, 1.0, 0.0, 1e6, 1.0),)
@@ -75,6 +75,33 @@ def test_heavy_tails_and_streets_in_false_modes_are_told() -> None:
     assert found.freedom <= 10
     assert 4 <= found.ridden <= 6
     assert found.ridden_ratio == pytest.approx(4.0, rel=0.2)
+
+
+def test_the_share_within_stated_sigmas_counts_streets_not_scenes() -> None:
+    rng = np.random.default_rng(8)
+    root = np.linalg.cholesky(EvidenceModel().covariance)
+    sigma = np.sqrt(np.diag(root @ root.T))
+    errors = [rng.normal(size=(int(rng.integers(1, 9)), 6)) for _ in range(200)]
+    blocks = [
+        _Block(
+            [Scene(row * sigma, root @ root.T, UNMOVED, 25.0 * k, k) for k, row in enumerate(street)], FLOOR
+        )
+        for street in errors
+    ]
+    for sigmas, chance in ((1.0, 0.683), (2.0, 0.954)):
+        share, low, high = _within(blocks, sigmas)
+        assert share == pytest.approx(float((np.abs(np.concatenate(errors)) < sigmas).mean()))
+        assert low < chance < high
+        # Of independent errors the interval is the binomial one.
+        count = sum(street.size for street in errors)
+        assert high - low == pytest.approx(3.29 * math.sqrt(share * (1 - share) / count), rel=0.2)
+        # Scenes that repeat each other tell no more than one.
+        alike = [
+            _Block([Scene(street[0] * sigma, root @ root.T, UNMOVED, 25.0 * k, k) for k in range(6)], FLOOR)
+            for street in errors
+        ]
+        _, least, most = _within(alike, sigmas)
+        assert most - least == pytest.approx(3.29 * math.sqrt(share * (1 - share) / 1200), rel=0.2)
 
 
 def test_few_streets_are_refused() -> None:

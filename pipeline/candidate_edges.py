@@ -120,7 +120,7 @@ def judge_candidates(
         along_road: Whether the place along the road is open, in the direction the candidate looks.
 
     Returns:
-        Distinct answers, the best first; none where the cloud shows no rings or too few edges.
+        Distinct answers, the best first; none where the cloud shows too few edges.
     """
     reached: list[tuple[float, Floats]] = []
     for T in candidates:

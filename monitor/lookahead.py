@@ -19,6 +19,9 @@ from pipeline.errors import CalibwatchError
 from pipeline.records import FramePair
 from pipeline.watch import Foresight, Watch
 
+_MOST_WAITING = 4096
+"""Arrivals that are kept while pairs are awaited: a sensor may be missing for long, and others go on."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
@@ -67,7 +70,7 @@ def arrivals(
         arrival_ns = item.now_ns if isinstance(item, Tick) else item.log_ns
         waiting.append(Arrival(arrival_ns, found, intake.accounts(), len(intake.notes)))
         pairs += len(found)
-        while waiting and pairs >= most:
+        while waiting and (pairs >= most or len(waiting) > _MOST_WAITING):
             arrival = waiting.popleft()
             pairs -= len(arrival.pairs)
             yield arrival

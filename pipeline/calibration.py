@@ -31,7 +31,7 @@ from pipeline.observability import Observability, observable
 from pipeline.parameters import Parameters
 from pipeline.records import AXES, CameraImage, Floats, FramePair, PointCloud, read_only
 from pipeline.segmentation import Segmenter, grid_scale
-from pipeline.sensor_seat import SensorSeat, sensor_seat
+from pipeline.sensor_seat import FULLER, SensorSeat, sensor_seat
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +162,7 @@ class Calibrator:
         self._settings = settings
         self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
         self._seat: SensorSeat | None = None
+        self._seat_points = 0
         self._kept: list[_Kept] = []
         self._stride = 1
 
@@ -176,9 +177,9 @@ class Calibrator:
         if dropped is not None:
             self.dropped[dropped] += 1
             return dropped
-        if self._seat is None:
+        if self._seat is None or len(pair.cloud) > FULLER * self._seat_points:
             # Of the sweep as it was measured: straightening bends its rings.
-            self._seat = sensor_seat(pair.cloud)
+            self._seat, self._seat_points = sensor_seat(pair.cloud), len(pair.cloud)
         with stage("motion"):
             straight = self._ego.straighten(pair)
         if self.frames % self._stride == 0:

@@ -171,9 +171,11 @@ def _capped(group: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     if len(group) <= most:
         return np.arange(len(group))
     counts = np.bincount(group)
-    caps = np.arange(1, int(counts.max()) + 1)
-    totals = np.minimum(counts[None, :], caps[:, None]).sum(axis=1)
-    cap = int(caps[max(0, int(np.searchsorted(totals, most, side="right")) - 1)])
+    cap, beyond = 1, int(counts.max())
+    while beyond - cap > 1:
+        middle = (cap + beyond) // 2
+        fits = int(np.minimum(counts, middle).sum()) <= most
+        cap, beyond = (middle, beyond) if fits else (cap, middle)
     order = np.argsort(group, kind="stable")
     starts = np.searchsorted(group[order], np.arange(len(counts)))
     rank = np.arange(len(group)) - starts[group[order]]

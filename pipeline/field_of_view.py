@@ -11,7 +11,7 @@ from pipeline.records import CameraModel, Floats, PointCloud
 
 
 def in_view(cloud: PointCloud, camera: CameraModel, T_cam_lidar: Floats) -> NDArray[np.bool_]:
-    """Points inside the camera's field of view plus a margin of some degrees, bool (N,)."""
+    """Points inside the camera's field of view plus a margin (3 deg ahead, less aside), bool (N,)."""
     border = _border_rays(camera)
     T = T_cam_lidar.astype(np.float32)
     z = cloud.xyz @ T[2, :3] + T[2, 3]

@@ -25,7 +25,7 @@ from pipeline.mount import Mount
 from pipeline.parameters import Parameters
 from pipeline.records import FramePair, Masks, PointCloud
 from pipeline.segmentation import Segmenter, grid_scale
-from pipeline.sensor_seat import SensorSeat, numbered, sensor_seat
+from pipeline.sensor_seat import FULLER, SensorSeat, numbered, sensor_seat
 from pipeline.spin_sense import ToldSpin
 
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
@@ -136,6 +136,7 @@ class Scout:
         self._segmenter = segmenter
         self._ego = Ego(mount.up, mount.T_cam_lidar[2, :3], mount.spin)
         self._seat: SensorSeat | None = None
+        self._seat_points = 0
         self._unnumbered = False
         self._lines_at: tuple[int, float] | None = None
         self._barren = False
@@ -175,9 +176,9 @@ class Scout:
             return Glimpse("empty_cloud", pair.cloud)
         self._count += 1
         rng = np.random.default_rng([self._parameters.seed, self._count])
-        if self._seat is None:
+        if self._seat is None or len(pair.cloud) > FULLER * self._seat_points:
             # Of the sweep as it was measured: straightening bends its rings.
-            self._seat = sensor_seat(pair.cloud)
+            self._seat, self._seat_points = sensor_seat(pair.cloud), len(pair.cloud)
             self._unnumbered = numbered(pair.cloud, self._seat) is not None
         with stage("motion"):
             cloud = numbered(pair.cloud, self._seat) if self._unnumbered else None

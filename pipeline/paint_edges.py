@@ -45,6 +45,10 @@ def paint_borders(
     noise = 1.48 * median(np.abs(np.diff(intensity)[pairs])) / math.sqrt(2.0) if pairs.any() else 0.0
     road = median(intensity[on_ground])
     least = max(parameters.paint_noise * noise, parameters.paint_contrast * road)
+    if least <= 0.0:
+        # Most of a dark road reads nothing: what reads least of the rest is noise.
+        rest = intensity[on_ground & (intensity > 0.0)]
+        least = parameters.paint_noise * float(rest.min()) if rest.size else 0.0
     # Stretches of ground without a gap; strips are sought inside each.
     starts = np.flatnonzero(np.concatenate([[True], ~pairs]))
     stretch = np.cumsum(np.concatenate([[True], ~pairs])) - 1

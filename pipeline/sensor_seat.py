@@ -31,6 +31,10 @@ _LEAST_UPRIGHT = math.cos(math.radians(30.0))
 _SHARPER = 0.5
 """Share of the rings' spread that must be gone when they are seen from the origin that was found."""
 
+FULLER = 1.25
+"""A sweep of so many times the points tells the seat anew: the first one after a start is often a part of a
+turn, which tells it wrongly. Whole sweeps of one drive differ by less."""
+
 _OUTLIER_SIGMAS = 3.0
 """Robust sigmas beyond which a point does not count: near objects between the lasers."""
 

@@ -10,6 +10,12 @@ from numpy.typing import NDArray
 
 from pipeline.records import Floats
 
+_MOST_POINTS = 4096
+"""Points about a peak beyond which it is let go: so many on two metres of road are no line of points."""
+
+_TABLE = 2_000_000
+"""Places of the table in which peaks are weighed at once: 16 MB for each of some such tables."""
+
 _ROAD_POINTS = 2
 """Points of road beside a strip, at least: one alone may be paint or a stone."""
 
@@ -48,9 +54,25 @@ def strips_about(
             compared with it.
         shape: What counts as a strip.
     """
-    peak, first, last = windows
-    if peak.size == 0:
+    few = np.flatnonzero(windows[2] - windows[1] <= _MOST_POINTS)
+    if few.size == 0:
         return []
+    widest = int((windows[2] - windows[1])[few].max())
+    found: list[list[float]] = []
+    for block in np.array_split(few, 1 + few.size * widest // _TABLE):
+        peak, first, last = (values[block] for values in windows)
+        found += _weighed(along, intensity, (peak, first, last), shape)
+    return found
+
+
+def _weighed(
+    along: Floats,
+    intensity: Floats,
+    windows: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+    shape: StripShape,
+) -> list[list[float]]:
+    """The strips about some peaks, at least one, with a table of all of their windows."""
+    peak, first, last = windows
     # A table with a row per peak; windows end at gaps of the ring, so rows are filled up with nothing.
     column = np.arange(int((last - first).max()))
     index = first[:, None] + column

@@ -140,8 +140,15 @@ def silent(memory: Memory, now_ns: int, parameters: VerdictParameters) -> Memory
 
 def unheard(memory: Memory, code: str, reason: str, now_ns: int, parameters: VerdictParameters) -> Memory:
     """A pair gave no evidence, for the reason given: what was known lasts no longer than patience does."""
-    patient = now_ns - memory.monitored_ns < parameters.patience_ns
-    if patient or memory.state not in ("starting", "healthy"):
+    known_ns = memory.monitored_ns
+    if memory.state == "suspect" and memory.severity is None:
+        # What is suspected need not be monitored: the last that any axis was seen.
+        known_ns = max(
+            known_ns, *(stamp for stamp in memory.last_seen_ns if stamp is not None), memory.since_ns
+        )
+    elif memory.state not in ("starting", "healthy"):
+        return memory
+    if now_ns - known_ns < parameters.patience_ns:
         return memory
     return _enter(memory, code, reason, now_ns)
 

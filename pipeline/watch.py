@@ -246,7 +246,7 @@ class Watch:
         if evidence.lines is not None:
             self._line_frames.append((now_ns, evidence.lines))
         if evidence.straight is not None:
-            self._retain()
+            self._retain(now_ns, evidence.straight.distance_m)
         return Findings(
             evidence.dropped,
             evidence.cloud,
@@ -256,12 +256,16 @@ class Watch:
             judged=False,
         )
 
-    def _retain(self) -> None:
+    def _retain(self, now_ns: int, way_m: float) -> None:
         """Drops what is too old or too dense from the window."""
         settings = self.parameters.window
+        # Frames without edges age those with them: else the last of those would speak for ever.
+        here = window.Candidate(now_ns, way_m, np.zeros((6, 6)))
+        while self._edge_frames and window.past(_candidate(self._edge_frames[0]), here, settings):
+            self._edge_frames.popleft()
+            self.departed["past"] += 1
         if self._edge_frames:
-            frames = [window.Candidate(f.stamp_ns, f.distance_m, f.information) for f in self._edge_frames]
-            kept, left = window.retained(frames, settings)
+            kept, left = window.retained([_candidate(frame) for frame in self._edge_frames], settings)
             self.departed.update(left)
             self._edge_frames = deque(self._edge_frames[index] for index in kept)
         while self._line_frames and self._line_frames[-1][0] - self._line_frames[0][0] > settings.longest_ns:
@@ -334,3 +338,8 @@ class Watch:
         trail = None if edges is None else edges.trail
         frames = tuple(self._edge_frames)
         return believe(self.mount, self.parameters, frames, lines, self.scenes.total.scenes, trail)
+
+
+def _candidate(frame: EdgeFrame) -> window.Candidate:
+    """What the choice of frames needs of one."""
+    return window.Candidate(frame.stamp_ns, frame.distance_m, frame.information)

@@ -101,7 +101,7 @@ def retained(frames: Sequence[Candidate], parameters: WindowParameters) -> tuple
     """
     newest = frames[-1]
     dense = max(0, len(frames) - parameters.dense_frames)
-    kept = [k for k, frame in enumerate(frames) if not _past(frame, newest, parameters)]
+    kept = [k for k, frame in enumerate(frames) if not past(frame, newest, parameters)]
     left: list[Departure] = ["past"] * (len(frames) - len(kept))
     reason: Departure
     while True:
@@ -118,10 +118,10 @@ def retained(frames: Sequence[Candidate], parameters: WindowParameters) -> tuple
         del kept[index]
 
 
-def _past(frame: Candidate, newest: Candidate, parameters: WindowParameters) -> bool:
+def past(frame: Candidate, now: Candidate, parameters: WindowParameters) -> bool:
     """Whether a frame no longer speaks of now."""
-    age = newest.stamp_ns - frame.stamp_ns
-    near = newest.way_m - frame.way_m <= parameters.near_m and age <= parameters.oldest_ns
+    age = now.stamp_ns - frame.stamp_ns
+    near = now.way_m - frame.way_m <= parameters.near_m and age <= parameters.oldest_ns
     return age > parameters.brief_ns and not near
 
 

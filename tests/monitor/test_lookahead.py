@@ -292,3 +292,18 @@ def test_arrivals_keep_their_order_and_their_accounts(rig, messages):
     for one, (_, pairs, _, _) in zip(ahead, plainly, strict=True):
         assert [pair.image_stamp_ns for pair in one.pairs] == [pair.image_stamp_ns for pair in pairs]
     assert np.array_equal(seen[0].cloud.xyz, shown[0].cloud.xyz)
+
+
+def test_a_sensor_that_is_missing_does_not_fill_the_memory(rig):
+    read = 0
+
+    def ticking():
+        nonlocal read
+        for stamp in range(20_000):
+            read += 1
+            yield Tick(stamp)
+
+    for number, arrival in enumerate(arrivals(ticking(), Intake(rig), 4, lambda pair: pair)):
+        assert arrival.arrival_ns == number
+        assert read - number < 5000
+    assert read == 20_000

@@ -208,6 +208,25 @@ def test_a_kerb_is_a_step_and_no_strip():
     assert not (found_in(cloud, flat(len(cloud))).kind == PAINT).any()
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_counts_on_a_dark_road_are_no_paint(share):
+    rng = np.random.default_rng(3)
+    found = found_in(cast(paint=lambda xyz: rng.poisson(share, len(xyz)) / 255.0), flat(1))
+    assert not (found.kind == PAINT).any()
+
+
+def test_bright_paint_on_a_road_that_reads_nothing_is_paint():
+    white, rng = stripes([(-2.0, -1.8), (1.0, 1.2)]), np.random.default_rng(4)
+
+    def read(xyz):
+        return rng.poisson(np.where(white(xyz) > 0.5, 60.0, 0.2)) / 255.0
+
+    found = found_in(cast(paint=read), flat(1))
+    paint = found.position[found.kind == PAINT]
+    assert len(paint) > 20
+    assert np.abs(paint[:, 1:2] - [-2.0, -1.8, 1.0, 1.2]).min(axis=1).max() < 0.15
+
+
 def test_paint_is_on_the_ground():
     cloud = cast([(8.0, -3, 3, -1.2, 1)], paint=lambda xyz: np.where(np.abs(xyz[:, 1] - 1) < 0.1, 0.6, 0.2))
     found = found_in(cloud, flat(len(cloud)))

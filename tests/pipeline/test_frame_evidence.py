@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from pipeline import se3
 from pipeline.frame_evidence import Scout
 from pipeline.mount import Mount
 from pipeline.parameters import Parameters
@@ -46,6 +47,27 @@ def test_another_scout_of_the_pair_finds_the_edges_that_the_first_left_open(scen
         np.testing.assert_array_equal(found.edge_points, whole.edge_points)
         np.testing.assert_array_equal(found.cloud.xyz, whole.cloud.xyz)
     assert (one.count, two.count, other.count) == (3, 3, 1)
+
+
+@pytest.mark.parametrize("points", [1, 3000])
+def test_a_part_of_a_sweep_at_the_start_does_not_settle_where_the_sensor_sits(scene, points):
+    mount, pairs = scene
+    # In the vehicle's frame the sensor is not at the origin.
+    T = mount.T_vehicle_lidar
+    mount = dataclasses.replace(
+        mount, T_cam_lidar=mount.T_cam_lidar @ se3.inverse(T), T_vehicle_lidar=np.eye(4)
+    )
+    moved = []
+    for pair in pairs:
+        xyz = se3.apply(T, pair.cloud.xyz).astype(np.float32)
+        moved.append(dataclasses.replace(pair, cloud=dataclasses.replace(pair.cloud, xyz=xyz, time=None)))
+    c = moved[0].cloud
+    part = PointCloud(c.xyz[:points], c.intensity[:points], c.ring[:points])
+    started, whole = (Scout(mount, Parameters(), None) for _ in range(2))
+    started.look(dataclasses.replace(moved[0], cloud=part))
+    started.forget()
+    found, expected = started.look(moved[1]), whole.look(moved[1])
+    np.testing.assert_array_equal(found.edges.position, expected.edges.position)
 
 
 def test_what_can_not_be_looked_at_is_dropped_in_either_way(scene):

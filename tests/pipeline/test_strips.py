@@ -1,8 +1,11 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline import strips
 from pipeline.strips import StripShape, strips_about
 
 SHAPE = StripShape(rise=0.08, asymmetry=0.35, narrowest_m=0.05, widest_m=0.8, background_m=0.6)
@@ -65,6 +68,25 @@ def test_strips_are_those_found_by_hand(seed):
         assert (expected is None) == (int(p) not in found)
         if expected is not None:
             assert found[int(p)] == pytest.approx(expected, abs=1e-9)
+
+
+def test_peaks_weighed_in_blocks_are_weighed_alike(monkeypatch):
+    along, intensity, *windows = line(1)
+    whole = strips_about(along, intensity, tuple(windows), SHAPE)
+    monkeypatch.setattr(strips, "_TABLE", 100)
+    assert strips_about(along, intensity, tuple(windows), SHAPE) == whole
+
+
+def test_points_without_number_on_a_short_way_cost_little():
+    along = np.linspace(0.0, 1.0, 60_000)
+    intensity = np.random.default_rng(0).uniform(0.1, 0.9, 60_000)
+    peak = np.arange(5, 60_000, 12)
+    window = (peak, np.zeros_like(peak), np.full_like(peak, 60_000))
+    tracemalloc.start()
+    assert strips_about(along, intensity, window, SHAPE) == []
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 50e6
 
 
 def test_there_are_strips_to_compare():

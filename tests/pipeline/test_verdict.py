@@ -350,6 +350,24 @@ def test_a_recording_that_ends_in_starting_says_why(judged, frames, code):
         assert ("yaw is known to 0.25 deg only" in memory.reason) == (judged is UNMONITORED)
 
 
+@pytest.mark.parametrize("judgements", [(), (QUIET,), (SUSPICIOUS,), (CONTRADICTED,)])
+def test_without_evidence_what_was_known_lasts_as_long_as_patience(judgements):
+    memory = walked(*judgements)
+    begun_ns, patience = memory.input_ns, P.patience_ns // S
+    for second in range(1, patience + 3):
+        now_ns = begun_ns + second * S
+        before, memory = memory, verdict.unheard(verdict.paired(memory, now_ns), *UNHEARD, now_ns, P)
+        if second < patience - 2:
+            assert told(memory) == told(before)
+    assert told(memory) == ("unobservable", UNHEARD[0])
+
+
+def test_without_evidence_a_drift_stands():
+    memory = drifted()
+    now_ns = memory.input_ns + 3600 * S
+    assert verdict.unheard(verdict.paired(memory, now_ns), *UNHEARD, now_ns, P).state == "drifted"
+
+
 @pytest.mark.parametrize("judgements", [(QUIET,), (SUSPICIOUS,), (ALARM,) * 3, (BLIND,) * 10])
 def test_a_reached_verdict_stands_at_the_end(judgements):
     memory = walked(*judgements)

@@ -253,6 +253,20 @@ def test_a_frame_that_gives_nothing_says_why_and_leaves_no_trace(reason, change)
     assert watch.window_stamps == (pairs[2].image_stamp_ns,)
 
 
+def test_frames_without_edges_age_those_with_them():
+    watch, pairs = fresh()
+    for pair in pairs[:3]:
+        watch.step(pair)
+    assert len(watch.window_stamps) == 3
+    bare = road_ahead(pairs[2])
+    for second in range(1, 40):
+        later = {name: getattr(bare, name) + second * 10**9 for name in ("cloud_stamp_ns", "image_stamp_ns")}
+        assert watch.step(dataclasses.replace(bare, **later)).dropped == "no_edges"
+    assert watch.window_stamps == ()
+    assert watch.departed["past"] == 3
+    assert watch.breaks == 0
+
+
 def test_findings_of_a_good_frame():
     watch, pairs = fresh()
     findings = watch.step(pairs[0])

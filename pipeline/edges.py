@@ -102,8 +102,9 @@ def _along_rings(
     """Edges of each kind, cloud's frame, of a sensor that spins about an axis of its own; None: no rings."""
     at_sensor = _seen_in(cloud, ground, T_lidar_sensor)
     for turn in spin_turns(at_sensor[0]):
-        T_lidar_spin = T_lidar_sensor @ se3.transform(turn.T, np.zeros(3))
-        own, plane = _seen_in(*at_sensor, se3.transform(turn.T, np.zeros(3)))
+        T_sensor_spin = se3.transform(turn.T, np.zeros(3))
+        T_lidar_spin = T_lidar_sensor @ T_sensor_spin
+        own, plane = _seen_in(*at_sensor, T_sensor_spin)
         pattern = scan_pattern(own, in_view(own, camera, T_cam_lidar @ T_lidar_spin))
         if pattern is not None and not rings_are_mixed(pattern, parameters):
             R, t = T_lidar_spin[:3, :3], T_lidar_spin[:3, 3]

@@ -31,9 +31,7 @@ def ring_edges(
         found.append(_jumps_between_rings(xyz, pattern, ground, parameters))
         if cloud.intensity is not None:
             intensity = cloud.intensity[pattern.index].astype(np.float64)
-            joined = (np.diff(pattern.ring) == 0) & (
-                np.diff(pattern.azimuth) < parameters.gap_steps * pattern.azimuth_step
-            )
+            joined = _joined(pattern, parameters)
             dx, dy, dz = np.diff(np.ascontiguousarray(xyz.T))
             way = np.sqrt(dx * dx + dy * dy + dz * dz)
             distance = pattern.distance
@@ -57,13 +55,17 @@ def rings_are_mixed(pattern: ScanPattern, parameters: EdgeParameters) -> bool:
     return bool(np.count_nonzero(back) > _THERE_AND_BACK * triples)
 
 
+def _joined(pattern: ScanPattern, parameters: EdgeParameters) -> NDArray[np.bool_]:
+    """Whether each point and the next (M-1,) share a ring without a gap."""
+    gap_rad = parameters.gap_steps * pattern.azimuth_step
+    return np.asarray((np.diff(pattern.ring) == 0) & (np.diff(pattern.azimuth) < gap_rad))
+
+
 def _leaps(
     pattern: ScanPattern, parameters: EdgeParameters
 ) -> tuple[NDArray[np.bool_], Floats, NDArray[np.bool_]]:
     """What lies between each point and the next (M-1,): no gap on one ring; range gained, m; a jump."""
-    linked = (np.diff(pattern.ring) == 0) & (
-        np.diff(pattern.azimuth) < parameters.gap_steps * pattern.azimuth_step
-    )
+    linked = _joined(pattern, parameters)
     leap = np.diff(pattern.distance)
     nearest = np.minimum(pattern.distance[:-1], pattern.distance[1:])
     least = np.maximum(parameters.jump_m, parameters.jump_share * nearest)
